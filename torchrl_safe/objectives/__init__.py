@@ -1,0 +1,14 @@
+"""Constrained losses and the rules that move their multipliers. Needs TorchRL only."""
+
+from torchrl_safe.objectives.cost_gae import CostGAE
+from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.multipliers import DualAscent, MultiplierUpdater
+from torchrl_safe.objectives.ppo_lagrangian import PPOLagrangianLoss
+
+__all__ = [
+    "CostGAE",
+    "DualAscent",
+    "MultiplierUpdater",
+    "PPOLagrangianLoss",
+    "penalized_advantage",
+]

@@ -1,0 +1,119 @@
+"""Generalized advantage estimation for several costs at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives.value import GAE
+
+
+class CostGAE(GAE):
+    r"""GAE of k costs, each with its own column, sharing one done signal.
+
+    This class is a thin specialization of :class:`~torchrl.objectives.value.GAE`
+    (Schulman et al. 2015, https://arxiv.org/abs/1506.02438). The differences are:
+
+    - it reads ``("next", "cost")`` and ``"cost_value"`` and writes ``"cost_advantage"`` and
+      ``"cost_value_target"``, all of shape ``(*B, T, k)``; ``done`` and ``terminated`` keep
+      their shape ``(*B, T, 1)`` and are broadcast over the k costs;
+    - ``average_gae`` **centres** each cost's advantage over the batch without dividing by its
+      standard deviation, so that a multiplier keeps its unit (reward per cost) from batch to
+      batch. It defaults to ``True``;
+    - ``vectorized`` defaults to ``True``.
+
+    Keyword Args:
+        gamma (float): discount of the costs.
+        lmbda (float): trace decay of the costs.
+        value_network (TensorDictModule, optional): cost critic with k outputs. ``None`` expects
+            ``"cost_value"`` and ``("next", "cost_value")`` in the data.
+        average_gae (bool, optional): centre the advantages. Defaults to ``True``.
+        vectorized (bool, optional): use the vectorized recursion. Defaults to ``True``.
+        **kwargs: the other arguments of :class:`~torchrl.objectives.value.GAE`, ``group_key``
+            excepted.
+
+    Raises:
+        ValueError: if the cost and the value of a batch differ in shape.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> critic = TensorDictModule(torch.nn.Linear(4, 2), ["observation"], ["cost_value"])
+        >>> gae = CostGAE(gamma=0.99, lmbda=0.95, value_network=critic)
+        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
+        >>> batch = TensorDict(
+        ...     observation=torch.randn(3, 5, 4),
+        ...     next=TensorDict(
+        ...         observation=torch.randn(3, 5, 4),
+        ...         cost=torch.rand(3, 5, 2),
+        ...         done=done,
+        ...         terminated=done,
+        ...         batch_size=[3, 5],
+        ...     ),
+        ...     batch_size=[3, 5],
+        ... )
+        >>> gae(batch)["cost_advantage"].shape
+        torch.Size([3, 5, 2])
+    """
+
+    @dataclass
+    class _AcceptedKeys(GAE._AcceptedKeys):
+        # All of them are declared again: set_keys looks at the class's own names only.
+        advantage: NestedKey = "cost_advantage"
+        value_target: NestedKey = "cost_value_target"
+        value: NestedKey = "cost_value"
+        reward: NestedKey = "cost"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"
+        sample_log_prob: NestedKey | None = None
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        *,
+        gamma: float | Tensor,
+        lmbda: float | Tensor,
+        value_network: TensorDictModuleBase | None,
+        average_gae: bool = True,
+        vectorized: bool | None = True,
+        **kwargs: Any,
+    ) -> None:
+        if kwargs.get("group_key") is not None:
+            raise ValueError("CostGAE centres over the whole batch: group_key is not supported.")
+        super().__init__(
+            gamma=gamma,
+            lmbda=lmbda,
+            value_network=value_network,
+            average_gae=average_gae,
+            vectorized=vectorized,
+            **kwargs,
+        )
+
+    def _prepare_signals(
+        self, reward: Tensor, done: Tensor, terminated: Tensor, value: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        if reward.shape != value.shape:
+            raise ValueError(
+                f"The cost {self.tensor_keys.reward!r} and its value {self.tensor_keys.value!r} "
+                f"must have one column for each constraint, got shapes {tuple(reward.shape)} and "
+                f"{tuple(value.shape)}."
+            )
+        return reward, done.expand_as(value), terminated.expand_as(value)
+
+    def _broadcast_optional(self, tensor: Tensor, value: Tensor) -> Tensor:
+        return tensor.expand_as(value)
+
+    def _normalize_advantage(
+        self, adv: Tensor, valid: Tensor | None = None, groups: Tensor | None = None
+    ) -> Tensor:
+        mask = torch.ones_like(adv) if valid is None else self._expand_to_match(valid, adv).to(adv)
+        batch_dims = tuple(range(adv.ndim - 1))
+        count = mask.sum(batch_dims, keepdim=True).clamp_min(1)
+        return adv - (adv * mask).sum(batch_dims, keepdim=True) / count

@@ -1,0 +1,193 @@
+"""Rules that move the Lagrange multipliers of a loss."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions.transforms import Transform
+from torchrl.objectives import LossModule
+
+
+class MultiplierUpdater(abc.ABC):
+    """Moves the multipliers of a loss towards its cost limits, once for each collected batch.
+
+    A rule is one method, :meth:`next_multiplier`; checking the costs, projecting on
+    ``[0, max_multiplier]`` and writing the buffer in place happen here, in the manner of
+    ``SoftUpdate(loss).step()``. A multiplier lives in the ``lagrange_multiplier`` buffer of the
+    loss and nowhere else.
+
+    Args:
+        loss_module (LossModule): a loss with a ``lagrange_multiplier`` buffer of shape ``(k,)``.
+
+    Keyword Args:
+        cost_limit (float or Tensor): limit of each expected episode cost, one number or k, in
+            the unit of the undiscounted episode cost.
+        max_multiplier (float, optional): upper bound of every multiplier. Defaults to no bound.
+
+    Raises:
+        ValueError: if the loss has no such buffer, or a limit or bound is not usable.
+    """
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        *,
+        cost_limit: float | Tensor,
+        max_multiplier: float | None = None,
+    ) -> None:
+        if not isinstance(loss_module, LossModule):
+            raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
+        multiplier = dict(loss_module.named_buffers(recurse=False)).get("lagrange_multiplier")
+        if multiplier is None:
+            raise ValueError(f"{type(loss_module).__name__} has no lagrange_multiplier buffer.")
+        limit = torch.as_tensor(cost_limit, dtype=multiplier.dtype)
+        if limit.shape not in ((), multiplier.shape):
+            raise ValueError(
+                f"cost_limit must be one number or one for each of the {len(multiplier)} costs, "
+                f"got shape {tuple(limit.shape)}."
+            )
+        if not limit.isfinite().all():
+            raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
+        if max_multiplier is not None and not max_multiplier > 0:
+            raise ValueError(f"max_multiplier must be positive, got {max_multiplier}.")
+        self.loss_module = loss_module
+        self.cost_limit = limit.expand_as(multiplier).clone()
+        self.max_multiplier = max_multiplier
+
+    @torch.no_grad()
+    def step(self, episode_cost: Tensor) -> None:
+        """Moves the multipliers once.
+
+        Args:
+            episode_cost (Tensor): undiscounted cost of each episode that ended in the batch,
+                shape ``(E, k)``. With ``E = 0`` nothing changes.
+
+        Raises:
+            ValueError: if the shape is wrong or a cost is NaN or infinite; nothing has changed
+                then.
+
+        Examples:
+            >>> # as collectors and RewardSum give it:
+            >>> # updater.step(batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)])
+        """
+        multiplier = self.loss_module.lagrange_multiplier
+        if episode_cost.ndim != 2 or episode_cost.shape[-1:] != multiplier.shape:
+            raise ValueError(
+                f"episode_cost must have shape (E, {len(multiplier)}), got "
+                f"{tuple(episode_cost.shape)}."
+            )
+        if not episode_cost.isfinite().all():
+            raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
+        if not len(episode_cost):
+            return
+        mean_cost = episode_cost.to(multiplier).mean(0)
+        proposal = self.next_multiplier(multiplier, mean_cost - self.cost_limit.to(multiplier))
+        multiplier.copy_(proposal.clamp(0, self.max_multiplier))
+
+    @abc.abstractmethod
+    def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
+        """Proposes the next multipliers; ``step`` projects them on ``[0, max_multiplier]``.
+
+        Args:
+            multiplier (Tensor): current multipliers, shape ``(k,)``. Not to be changed.
+            violation (Tensor): mean episode cost minus limit, shape ``(k,)``.
+
+        Returns:
+            The proposed multipliers, shape ``(k,)``.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the state of the rule; the multipliers are in the state of the loss."""
+        return {"cost_limit": self.cost_limit.clone(), "max_multiplier": self.max_multiplier}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Loads a state that :meth:`state_dict` returned."""
+        self.cost_limit = state_dict["cost_limit"].clone()
+        self.max_multiplier = state_dict["max_multiplier"]
+
+
+class DualAscent(MultiplierUpdater):
+    r"""Projected gradient ascent on the dual: the step is proportional to the violation.
+
+    .. math::
+        \lambda \leftarrow \mathrm{clip}(\lambda + \mathrm{lr} \, (J_c - d),\ 0,\ \mathrm{max})
+
+    ``optimizer`` and ``parametrization`` give the published variants: Adam on the raw
+    multiplier (OmniSafe, SafePO), Adam on a softplus parameter (Safety Gym: Ray et al. 2019).
+    Adam's step is about ``lr`` whatever the size of the violation.
+
+    Args:
+        loss_module (LossModule): see :class:`MultiplierUpdater`.
+
+    Keyword Args:
+        cost_limit (float or Tensor): see :class:`MultiplierUpdater`.
+        lr (float): step size, in multiplier per unit of violated cost.
+        max_multiplier (float, optional): see :class:`MultiplierUpdater`.
+        optimizer (callable, optional): called as ``optimizer([parameter], lr=lr)``.
+            Defaults to :class:`torch.optim.SGD`.
+        parametrization (Transform, optional): the multiplier as a function of the parameter
+            that the gradient step acts on, for example
+            ``torch.distributions.transforms.SoftplusTransform()``. As published, the gradient
+            is that of the parameter times the violation, without the transform's derivative.
+            Defaults to none: the multiplier itself.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.objectives import LossModule
+        >>> loss = LossModule()
+        >>> loss.register_buffer("lagrange_multiplier", torch.zeros(2))
+        >>> updater = DualAscent(loss, cost_limit=torch.tensor([1.0, 5.0]), lr=0.5)
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 0.0]]))
+        >>> loss.lagrange_multiplier
+        tensor([1., 0.])
+    """
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        *,
+        cost_limit: float | Tensor,
+        lr: float,
+        max_multiplier: float | None = None,
+        optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.SGD,
+        parametrization: Transform | None = None,
+    ) -> None:
+        super().__init__(loss_module, cost_limit=cost_limit, max_multiplier=max_multiplier)
+        if not 0 < lr < float("inf"):
+            raise ValueError(f"lr must be positive and finite, got {lr}.")
+        multiplier = loss_module.lagrange_multiplier
+        if parametrization is not None and not parametrization.inv(multiplier).isfinite().all():
+            raise ValueError(
+                f"The multiplier to start with, {multiplier.tolist()}, is out of the range of "
+                f"parametrization {parametrization}."
+            )
+        self.parametrization = parametrization
+        self._parameter = torch.zeros_like(multiplier)
+        self.optimizer = optimizer([self._parameter], lr=lr)
+
+    def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
+        parameter = self._parameter
+        # The buffer is the only home of the multiplier: the parameter is read from it each time,
+        # so that a loaded or assigned multiplier is never overwritten by a stale one.
+        parameter.copy_(multiplier if self.parametrization is None else self._inverse(multiplier))
+        parameter.grad = -violation.to(parameter)
+        self.optimizer.step()
+        return parameter.clone() if self.parametrization is None else self._forward(parameter)
+
+    def _inverse(self, multiplier: Tensor) -> Tensor:
+        # A multiplier that has underflowed to zero stays a finite parameter.
+        return self.parametrization.inv(multiplier.clamp_min(torch.finfo(multiplier.dtype).tiny))
+
+    def _forward(self, parameter: Tensor) -> Tensor:
+        return self.parametrization(parameter)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self.optimizer.load_state_dict(state_dict["optimizer"])
