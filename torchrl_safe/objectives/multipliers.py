@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions.transforms import Transform
+from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
 
@@ -133,7 +133,7 @@ class DualAscent(MultiplierUpdater):
             that the gradient step acts on, for example
             ``torch.distributions.transforms.SoftplusTransform()``. As published, the gradient
             is that of the parameter times the violation, without the transform's derivative.
-            Defaults to none: the multiplier itself.
+            Defaults to the identity: the multiplier itself.
 
     Examples:
         >>> import torch
@@ -154,36 +154,29 @@ class DualAscent(MultiplierUpdater):
         lr: float,
         max_multiplier: float | None = None,
         optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.SGD,
-        parametrization: Transform | None = None,
+        parametrization: Transform = identity_transform,
     ) -> None:
         super().__init__(loss_module, cost_limit=cost_limit, max_multiplier=max_multiplier)
         if not 0 < lr < float("inf"):
             raise ValueError(f"lr must be positive and finite, got {lr}.")
         multiplier = loss_module.lagrange_multiplier
-        if parametrization is not None and not parametrization.inv(multiplier).isfinite().all():
+        if not parametrization.inv(multiplier).isfinite().all():
             raise ValueError(
-                f"The multiplier to start with, {multiplier.tolist()}, is out of the range of "
-                f"parametrization {parametrization}."
+                f"parametrization {parametrization} cannot give the multiplier to start with, "
+                f"{multiplier.tolist()}."
             )
         self.parametrization = parametrization
         self._parameter = torch.zeros_like(multiplier)
         self.optimizer = optimizer([self._parameter], lr=lr)
 
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
-        parameter = self._parameter
         # The buffer is the only home of the multiplier: the parameter is read from it each time,
-        # so that a loaded or assigned multiplier is never overwritten by a stale one.
-        parameter.copy_(multiplier if self.parametrization is None else self._inverse(multiplier))
-        parameter.grad = -violation.to(parameter)
+        # so that a loaded or assigned multiplier is never overwritten by a stale one. The bound
+        # lets a softplus that has underflowed to zero come back.
+        self._parameter.copy_(self.parametrization.inv(multiplier).clamp_min(-80))
+        self._parameter.grad = -violation.to(self._parameter)
         self.optimizer.step()
-        return parameter.clone() if self.parametrization is None else self._forward(parameter)
-
-    def _inverse(self, multiplier: Tensor) -> Tensor:
-        # A multiplier that has underflowed to zero stays a finite parameter.
-        return self.parametrization.inv(multiplier.clamp_min(torch.finfo(multiplier.dtype).tiny))
-
-    def _forward(self, parameter: Tensor) -> Tensor:
-        return self.parametrization(parameter)
+        return self.parametrization(self._parameter).to(multiplier)
 
     def state_dict(self) -> dict[str, Any]:
         return {**super().state_dict(), "optimizer": self.optimizer.state_dict()}

@@ -116,6 +116,7 @@ class PPOLagrangianLoss(ClipPPOLoss):
     target_cost_critic_network_params: TensorDictParams
     lagrange_multiplier: Tensor
     cost_critic_coeff: Tensor
+    _out_keys: list[NestedKey] | None
 
     def __init__(
         self,
@@ -131,7 +132,7 @@ class PPOLagrangianLoss(ClipPPOLoss):
         multiplier = _initial_multiplier(num_costs, multiplier_init)
         # The parent's constructor already asks for in_keys, before a module can be assigned.
         self._cost_critic_in_keys = list(cost_critic_network.in_keys)
-        self._cost_value_estimator = None
+        self._cost_value_estimator: ValueEstimatorBase | None = None
         super().__init__(actor_network, critic_network, **kwargs)
         if self.functional:
             self.convert_to_functional(
