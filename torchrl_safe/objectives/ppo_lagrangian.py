@@ -147,9 +147,8 @@ class PPOLagrangianLoss(ClipPPOLoss):
         device = self.entropy_coeff.device
         self.register_buffer("lagrange_multiplier", multiplier.to(device))
         self.register_coeff_buffer("cost_critic_coeff", cost_critic_coeff, device=device)
-        # Built here, not at first use, so that a fresh and a used loss have the same state_dict.
-        self.make_value_estimator()
-        self.make_cost_value_estimator()
+        self.register_state_dict_pre_hook(_build_value_estimators)
+        self.register_load_state_dict_pre_hook(_build_value_estimators)
 
     def make_cost_value_estimator(
         self, estimator: ValueEstimatorBase | None = None, **hyperparams: Any
@@ -167,12 +166,9 @@ class PPOLagrangianLoss(ClipPPOLoss):
             The loss itself.
         """
         if estimator is None:
-            hyperparams = {"gamma": 0.99, "lmbda": 0.95, **hyperparams}
-            estimator = CostGAE(
-                value_network=self.cost_critic_network,
-                device=self.lagrange_multiplier.device,
-                **hyperparams,
-            )
+            device = self.lagrange_multiplier.device
+            hyperparams = {"gamma": 0.99, "lmbda": 0.95, "device": device, **hyperparams}
+            estimator = CostGAE(value_network=self.cost_critic_network, **hyperparams)
         elif hyperparams:
             raise ValueError(
                 f"Pass an estimator or hyperparameters, not both: got {estimator} and "
@@ -185,6 +181,8 @@ class PPOLagrangianLoss(ClipPPOLoss):
     @property
     def cost_value_estimator(self) -> ValueEstimatorBase:
         """The value estimator of the costs."""
+        if self._cost_value_estimator is None:
+            self.make_cost_value_estimator()
         return self._cost_value_estimator
 
     @torch.no_grad()
@@ -216,9 +214,7 @@ class PPOLagrangianLoss(ClipPPOLoss):
         return self._estimate_cost_advantage(tensordict)
 
     def _estimate_cost_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
-        cost_key = unravel_key(("next", self.tensor_keys.cost))
-        if tensordict.get(cost_key, None) is None:
-            raise KeyError(f"The cost {cost_key} was not found in the input tensordict.")
+        _get_or_raise(tensordict, unravel_key(("next", self.tensor_keys.cost)))
         params = self.cost_critic_network_params
         return self.cost_value_estimator(
             tensordict,
@@ -249,8 +245,10 @@ class PPOLagrangianLoss(ClipPPOLoss):
         """
         if self.separate_losses:
             tensordict = tensordict.detach()
-        target = tensordict.get(self.tensor_keys.cost_value_target)
-        old_value = tensordict.get(self.tensor_keys.cost_value) if self.clip_value else None
+        target = _get_or_raise(tensordict, self.tensor_keys.cost_value_target)
+        old_value = None
+        if self.clip_value:
+            old_value = _get_or_raise(tensordict, self.tensor_keys.cost_value)
         with (
             self.cost_critic_network_params.to_module(
                 self.cost_critic_network, preserve_module_state=False
@@ -328,6 +326,18 @@ class PPOLagrangianLoss(ClipPPOLoss):
                 done=self.tensor_keys.done,
                 terminated=self.tensor_keys.terminated,
             )
+
+
+def _build_value_estimators(loss: PPOLagrangianLoss, *_: Any) -> None:
+    # Their buffers are part of the state: a fresh and a used loss then have the same entries.
+    _ = loss.value_estimator, loss.cost_value_estimator
+
+
+def _get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    tensor = tensordict.get(key, None)
+    if tensor is None:
+        raise KeyError(f"The key {key!r} was not found in the input tensordict.")
+    return tensor
 
 
 def _initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:

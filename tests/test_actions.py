@@ -1,0 +1,144 @@
+"""Actions and inverse kinematics in the real simulator."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_safe.envs import (
+    PANDA,
+    ArmEnv,
+    BulletInverseKinematics,
+    CartesianDelta,
+    DampedLeastSquares,
+    JointDelta,
+    NoObstacles,
+)
+from torchrl_safe.envs.bullet import Scene, World
+from torchrl_safe.envs.kinematics import rotation_vector
+
+
+def drive(env, goal, steps):
+    """Moves the tool towards a point, as a policy that sees the goal would."""
+    for _ in range(steps):
+        delta = torch.as_tensor(goal - env.arm_state.ee_position) / env.action_mode.step
+        env.step(env.fake_tensordict().select().set("action", delta.float()))
+    return env.arm_state
+
+
+@pytest.mark.parametrize("solver", [DampedLeastSquares(), BulletInverseKinematics()], ids=str)
+def test_tool_reaches_targets_to_a_millimetre(make_env, solver):
+    corners = np.array(
+        [[x, y, z] for x in (0.45, 0.7) for y in (-0.2, 0.2) for z in (0.05, 0.3)], float
+    )
+    action = CartesianDelta(inverse_kinematics=solver)
+    env = make_env(ArmEnv, num_envs=len(corners), action=action, obstacles=NoObstacles(), seed=0)
+    env.reset()
+    state = drive(env, corners, 60)
+    assert np.linalg.norm(state.ee_position - corners, axis=1).max() < 1e-3
+    tilt = rotation_vector(state.ee_orientation, np.asarray(env._worlds[0].home_orientation))
+    assert np.abs(tilt).max() < 0.02
+    assert (state.joint_position >= state.joint_lower).all()
+    assert (state.joint_position <= state.joint_upper).all()
+
+
+def state_of(world):
+    """What DampedLeastSquares reads, of one world whose joints were set by hand."""
+    row = np.array(world.read(fresh=True))
+    widths = world.widths()
+    parts = dict(zip(widths, np.split(row, np.cumsum([*widths.values()])[:-1]), strict=True))
+    return SimpleNamespace(
+        **{name: part[None] for name, part in parts.items()},
+        joint_lower=world.joint_lower,
+        joint_upper=world.joint_upper,
+    )
+
+
+def test_one_step_of_least_squares_lands_near_the_target():
+    world = World(PANDA, Scene(), ())
+    check = World(PANDA, Scene(), ())
+    try:
+        rng = np.random.default_rng(0)
+        home = np.array(PANDA.home)
+        errors = []
+        for _ in range(50):
+            world._set_joints(home + rng.uniform(-0.3, 0.3, 7))
+            state = state_of(world)
+            target = state.ee_position + rng.uniform(-0.03, 0.03, 3)
+            # The wanted orientation is the present one, so that only the position moves.
+            angles = DampedLeastSquares()(target, state.ee_orientation[0], state, [world])
+            check._set_joints(angles[0])
+            errors.append(np.linalg.norm(state_of(check).ee_position - target))
+        assert np.median(errors) < 0.004
+    finally:
+        world.close()
+        check.close()
+
+
+def test_jacobian_is_the_derivative_of_the_tool_point():
+    world = World(PANDA, Scene(free_fingers=True), ())
+    try:
+        angles = np.array(PANDA.home) + 0.1
+        jacobian = np.array(world.jacobian(angles.tolist()))
+        for joint in range(7):
+            ends = []
+            for sign in (1, -1):
+                moved = angles.copy()
+                moved[joint] += sign * 1e-3
+                world._set_joints([*moved, 0, 0])
+                ends.append(state_of(world).ee_position[0])
+            slope = (ends[0] - ends[1]) / 2e-3
+            np.testing.assert_allclose(jacobian[:3, joint], slope, atol=1e-4)
+    finally:
+        world.close()
+
+
+@pytest.mark.parametrize("action", [CartesianDelta(), JointDelta()], ids=lambda a: type(a).__name__)
+def test_full_action_keeps_joint_limits(make_env, action):
+    env = make_env(ArmEnv, num_envs=2, action=action, obstacles=NoObstacles(), seed=0)
+    actions = torch.ones(env.action_spec.shape)
+    actions[1] = -1
+    env.reset()
+    # Long enough for every joint to meet its stop, time limit or not.
+    for _ in range(100):
+        env.step(env.fake_tensordict().select().set("action", actions))
+    state = env.arm_state
+    assert (state.joint_position >= state.joint_lower - 0.01).all()
+    assert (state.joint_position <= state.joint_upper + 0.01).all()
+
+
+def test_joint_delta_turns_the_joints(make_env):
+    env = make_env(ArmEnv, action=JointDelta(step=0.1), obstacles=NoObstacles(), seed=0)
+    env.reset()
+    before = env.arm_state.joint_position.copy()
+    action = torch.tensor([[0.5, 0, 0, 0, 0, 0, -0.5]])
+    env.step(env.fake_tensordict().select().set("action", action))
+    moved = (env.arm_state.joint_position - before)[0]
+    # The motors close most, not all, of the gap within one control step.
+    assert 0.02 < moved[0] < 0.055
+    assert -0.055 < moved[6] < -0.02
+    np.testing.assert_allclose(moved[1:6], 0, atol=5e-3)
+
+
+def test_rotation_vector_takes_the_short_way():
+    angle = 0.2
+    current = np.array([[0, 0, 0, 1.0], [0, 0, 0, -1.0]])
+    wanted = np.array([math.sin(angle / 2), 0, 0, math.cos(angle / 2)])
+    expected = [[2 * math.sin(angle / 2), 0, 0]] * 2
+    np.testing.assert_allclose(rotation_vector(current, wanted), expected)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: CartesianDelta(step=0), "step must be positive, got 0"),
+        (lambda: CartesianDelta(bound=-1), "bound must be positive, got -1"),
+        (lambda: JointDelta(step=float("nan")), "step must be positive, got nan"),
+        (lambda: DampedLeastSquares(damping=0), "damping must be positive, got 0"),
+    ],
+)
+def test_bad_arguments(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

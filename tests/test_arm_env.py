@@ -1,0 +1,308 @@
+"""ArmEnv as an environment: specs, seeds, resets, time limits, errors."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_safe.envs import (
+    ArmEnv,
+    CartesianDelta,
+    Collision,
+    Cylinder,
+    InFront,
+    JointDelta,
+    NoObstacles,
+)
+
+ACTIONS = [CartesianDelta(), JointDelta()]
+ROLLING = InFront(shape=Cylinder(mass=1.0))
+by_name = {"ids": lambda value: type(value).__name__}
+
+
+def always(value):
+    """A cost that is the same everywhere."""
+    return lambda state: np.full(len(state.goal), float(value))
+
+
+def step(env, action):
+    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
+
+
+def towards(env, point):
+    """The action that moves the tool towards a point, as fast as it can."""
+    delta = torch.as_tensor(point - env.arm_state.ee_position) / env.action_mode.step
+    return delta.float().clamp(-1, 1)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("action", ACTIONS, **by_name)
+@pytest.mark.parametrize(
+    "obstacles", [InFront(), ROLLING, NoObstacles()], ids=["fixed", "free", "none"]
+)
+def test_specs(make_env, num_envs, action, obstacles):
+    costs = {"collision": Collision(), "one": always(1)}
+    env = make_env(
+        ArmEnv,
+        num_envs=num_envs,
+        action=action,
+        obstacles=obstacles,
+        costs=costs,
+        max_episode_steps=5,
+    )
+    check_env_specs(env)
+    assert env.batch_size == (num_envs,)
+    assert env.cost_names == ("collision", "one")
+    assert env.full_reward_spec["cost"].shape == (num_envs, 2)
+    assert env.full_reward_spec["cost"].dtype == torch.float32
+    assert env.control_rate == 20
+
+
+def test_observation_fields(make_env):
+    env = make_env(ArmEnv, num_envs=2, seed=0)
+    observation = env.reset()["observation"].numpy()
+    state, fields = env.arm_state, env.observation_fields
+    assert observation.shape[1] == max(field.stop for field in fields.values())
+    np.testing.assert_allclose(observation[:, fields["ee_position"]], state.ee_position, atol=1e-6)
+    np.testing.assert_allclose(
+        observation[:, fields["goal"]], state.goal - state.ee_position, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        observation[:, fields["obstacle_position"]],
+        state.obstacle_position[:, 0] - state.ee_position,
+        atol=1e-6,
+    )
+    np.testing.assert_allclose(observation[:, fields["obstacle_size"]], [[0.05, 0.05, 0.1]] * 2)
+
+
+@pytest.mark.parametrize("obstacles", [InFront(), ROLLING], ids=["fixed", "free"])
+@pytest.mark.parametrize("action", ACTIONS, **by_name)
+def test_same_seed_same_rollout_bit_for_bit(make_env, action, obstacles):
+    """In a fresh environment, and again in one that has run before: resets forget everything."""
+    settings = {"num_envs": 3, "action": action, "obstacles": obstacles, "max_episode_steps": 9}
+    first = make_env(ArmEnv, **settings, seed=7)
+    actions = torch.rand(40, *first.action_spec.shape, generator=torch.manual_seed(0)) * 2 - 1
+
+    def play(env):
+        queue = iter(actions)
+        return env.rollout(40, lambda td: td.set("action", next(queue)), break_when_any_done=False)
+
+    one = play(first)
+    second = make_env(ArmEnv, **settings, seed=99)
+    play(second)
+    second.set_seed(7)
+    two = play(second)
+    assert one["next", "done"].any()
+    for key in one.keys(True, True):
+        assert torch.equal(one[key], two[key]), key
+
+
+def test_other_seed_other_goals(make_env):
+    env = make_env(ArmEnv, num_envs=2, seed=0)
+    goals = []
+    for seed in (0, None, 1):
+        if seed is not None:
+            env.set_seed(seed)
+        env.reset()
+        goals.append(env.arm_state.goal)
+    goals = np.concatenate(goals)
+    assert len(np.unique(goals, axis=0)) == len(goals) == 6
+
+
+def test_rows_are_seeded_as_workers_are(make_env):
+    """Two environments of one world, seeded in TorchRL's chain, are one environment of two."""
+    both = make_env(ArmEnv, num_envs=2, seed=3)
+    one = make_env(ArmEnv)
+    two = make_env(ArmEnv)
+    following = two.set_seed(one.set_seed(3))
+    assert following == both.set_seed(3)
+    for env in (both, one, two):
+        env.reset()
+    np.testing.assert_array_equal(
+        both.arm_state.goal, np.concatenate([one.arm_state.goal, two.arm_state.goal])
+    )
+
+
+def test_partial_reset_leaves_the_other_worlds_alone(make_env):
+    """Row 1 must go on as if row 0 had never been reset: its simulator, not only its output."""
+    settings = {"num_envs": 2, "obstacles": ROLLING, "seed": 5}
+    alone, disturbed = make_env(ArmEnv, **settings), make_env(ArmEnv, **settings)
+    for env in (alone, disturbed):
+        env.reset()
+    mask = torch.tensor([[True], [False]])
+    for index in range(12):
+        goal = alone.arm_state.goal
+        action = towards(alone, goal)
+        action[0] = 0
+        expected, got = step(alone, action), step(disturbed, action)
+        for key in ("observation", "reward", "cost"):
+            assert torch.equal(expected[key][1], got[key][1]), (index, key)
+        if index % 3 == 2:
+            before = got["observation"][1].clone()
+            after = disturbed.reset(TensorDict({"_reset": mask, **got}, batch_size=[2]))
+            assert torch.equal(after["observation"][1], before)
+    # Row 0 did start again, with a new goal.
+    assert not np.array_equal(alone.arm_state.goal[0], disturbed.arm_state.goal[0])
+    assert np.array_equal(alone.arm_state.goal[1], disturbed.arm_state.goal[1])
+
+
+def test_time_limit_truncates(make_env):
+    env = make_env(ArmEnv, num_envs=2, max_episode_steps=3, seed=0)
+    rollout = env.rollout(3, lambda td: td.set("action", torch.zeros(2, 3)))
+    truncated = rollout["next", "truncated"].squeeze(-1)
+    assert truncated.tolist() == [[False, False, True]] * 2
+    assert torch.equal(rollout["next", "done"].squeeze(-1), truncated)
+    assert not rollout["next", "terminated"].any()
+    assert not rollout["next", "success"].any()
+
+
+def test_success_terminates(make_env):
+    env = make_env(ArmEnv, num_envs=2, obstacles=NoObstacles(), seed=0)
+    env.reset()
+    for _ in range(40):
+        result = step(env, towards(env, env.arm_state.goal))
+        distance = np.linalg.norm(env.arm_state.ee_position - env.arm_state.goal, axis=1)
+        np.testing.assert_allclose(result["reward"][:, 0], -distance, rtol=1e-5)
+        assert result["success"].squeeze(-1).tolist() == (distance < 0.05).tolist()
+        assert torch.equal(result["terminated"], result["success"])
+        assert torch.equal(result["done"], result["success"])
+        if result["success"].all():
+            break
+    else:
+        pytest.fail("the tool never arrived")
+
+
+def test_terminal_observation_is_true(make_env):
+    """After an automatic reset, "next" still holds where the episode ended."""
+    env = make_env(ArmEnv, max_episode_steps=4, obstacles=NoObstacles(), seed=0)
+    rollout = env.rollout(
+        8, lambda td: td.set("action", torch.tensor([[1.0, 0, 0]])), break_when_any_done=False
+    )
+    x = env.observation_fields["ee_position"].start
+    assert rollout["next", "observation"][0, 3, x] > rollout["observation"][0, 3, x] + 0.02
+    assert rollout["observation"][0, 4, x] == rollout["observation"][0, 0, x]
+    assert rollout["next", "truncated"].flatten().tolist() == [False, False, False, True] * 2
+
+
+def test_touch_in_the_middle_of_a_control_step_counts(make_env):
+    """Each substep is read: a touch that is over at the end of the control step still costs."""
+    coarse = make_env(ArmEnv, frame_skip=12, seed=0)
+    coarse.reset()
+    fine = make_env(ArmEnv, frame_skip=12, seed=0)
+    fine.reset()
+    lost = 0
+    for index in range(40):
+        # Into the obstacle and off it again.
+        aim = (
+            coarse.arm_state.obstacle_position[:, 0]
+            if index % 4 < 2
+            else np.array([[0.35, 0, 0.2]])
+        )
+        action = towards(coarse, aim)
+        cost = step(coarse, action)["cost"].item()
+        # The same motion by hand, one substep at a time.
+        joints, fingers = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._worlds)
+        touches = [
+            fine._worlds[0].advance(joints[0].tolist(), fingers[0].tolist(), 1)[0] <= 0
+            for _ in range(12)
+        ]
+        fine._rows = [fine._worlds[0].read()]
+        fine._state = fine._make_state(fine._no_contact())
+        assert cost == float(any(touches)), index
+        lost += any(touches) and not touches[-1]
+    assert lost > 0
+
+
+def test_actions_are_clipped(make_env):
+    settings = {"num_envs": 1, "seed": 0}
+    one, two = make_env(ArmEnv, **settings), make_env(ArmEnv, **settings)
+    one.reset(), two.reset()
+    big, unit = torch.tensor([[5.0, -7.0, 0.5]]), torch.tensor([[1.0, -1.0, 0.5]])
+    assert torch.equal(step(one, big)["observation"], step(two, unit)["observation"])
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_action_must_be_finite(make_env, value):
+    env = make_env(ArmEnv, num_envs=3, seed=0)
+    env.reset()
+    action = torch.zeros(3, 3)
+    action[1, 2] = value
+    with pytest.raises(
+        ValueError, match=r"action must be finite, got NaN or infinity in rows \[1\]"
+    ):
+        step(env, action)
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (3, 1), (3,)])
+def test_action_must_have_its_shape(make_env, shape):
+    env = make_env(ArmEnv, num_envs=3, seed=0)
+    env.reset()
+    message = f"action must have shape (3, 3), got {shape}."
+    with pytest.raises(ValueError, match=re.escape(message)):
+        step(env, torch.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be a whole number of at least 1, got 0"),
+        ({"frame_skip": 2.5}, "frame_skip must be a whole number of at least 1, got 2.5"),
+        ({"max_episode_steps": -1}, "max_episode_steps must be a whole number"),
+        ({"costs": {}}, "costs must name at least one cost"),
+        ({"costs": {"flat": lambda state: 0.0}}, r"cost 'flat' must have shape \(1,\), got \(\)"),
+        ({"costs": {"nan": always("nan")}}, "cost 'nan' must be finite"),
+    ],
+    ids=["num_envs", "frame_skip", "max_episode_steps", "no-costs", "cost-shape", "cost-nan"],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ArmEnv(**arguments)
+
+
+def test_nan_cost_raises_at_the_step_where_it_appears(make_env):
+    def late(state):
+        moved = np.abs(state.joint_velocity).max(axis=1) > 0.01
+        return np.where(moved, np.nan, 0.0)
+
+    env = make_env(ArmEnv, costs={"late": late}, seed=0)
+    env.reset()
+    with pytest.raises(ValueError, match="cost 'late' must be finite"):
+        step(env, torch.ones(1, 3))
+
+
+def test_device_is_that_of_the_tensors(make_env):
+    env = make_env(ArmEnv, num_envs=2, device="cpu", seed=0)
+    rollout = env.rollout(2)
+    assert rollout.device == torch.device("cpu")
+
+
+@pytest.mark.parametrize("action", ACTIONS, **by_name)
+def test_velocities_are_derivatives(make_env, action):
+    """At one substep a control step, velocity times 1/240 s is the change of position."""
+    env = make_env(ArmEnv, action=action, frame_skip=1, obstacles=NoObstacles(), seed=0)
+    env.reset()
+    for _ in range(30):
+        before = env.arm_state
+        step(env, torch.full(env.action_spec.shape, 0.5))
+        after = env.arm_state
+        for position, velocity in (
+            ("ee_position", "ee_velocity"),
+            ("joint_position", "joint_velocity"),
+        ):
+            change = (getattr(after, position) - getattr(before, position)) * 240
+            np.testing.assert_allclose(getattr(after, velocity), change, atol=0.02)
+    assert np.abs(env.arm_state.ee_velocity).max() > 0.1
+
+
+def test_render(make_env):
+    env = make_env(ArmEnv, num_envs=2, seed=0)
+    env.reset()
+    pixels = env.render(width=96, height=64)
+    assert pixels.shape == (2, 64, 96, 3)
+    assert pixels.dtype == torch.uint8
+    red = (pixels[..., 0] > 120) & (pixels[..., 1] < 60) & (pixels[..., 2] < 60)
+    assert red.flatten(1).sum(1).min() > 20, "the obstacle is in the picture"
+    assert not torch.equal(pixels[0], pixels[1]), "each world has its own goal"

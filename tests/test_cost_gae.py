@@ -1,0 +1,200 @@
+"""CostGAE against the recursion of Schulman et al. 2015, written out in plain Python."""
+
+import re
+
+import pytest
+import torch
+from networks import make_batch, make_critic
+from tensordict import TensorDict
+
+from torchrl_safe.objectives import CostGAE
+
+GAMMA, LMBDA = 0.9, 0.7
+
+
+@pytest.fixture(params=[1, 3], ids=["one-cost", "three-costs"])
+def num_costs(request):
+    return request.param
+
+
+def with_values(num_costs):
+    """A batch that holds random values, so that no network is needed."""
+    batch = make_batch(num_costs)
+    torch.manual_seed(2)
+    batch["cost_value"] = torch.randn(*batch.shape, num_costs)
+    batch["next", "cost_value"] = torch.randn(*batch.shape, num_costs)
+    return batch
+
+
+def recursion(batch, gamma=GAMMA, lmbda=LMBDA):
+    """Advantages of every row and cost: the same formula read literally."""
+    rows, steps = batch.shape
+    cost, value = batch["next", "cost"].tolist(), batch["cost_value"].tolist()
+    next_value = batch["next", "cost_value"].tolist()
+    done, terminated = batch["next", "done"].tolist(), batch["next", "terminated"].tolist()
+    advantage = torch.zeros_like(batch["next", "cost"])
+    for row in range(rows):
+        for column in range(advantage.shape[-1]):
+            later = 0.0
+            for step in reversed(range(steps)):
+                bootstrap = 0.0 if terminated[row][step][0] else next_value[row][step][column]
+                delta = cost[row][step][column] + gamma * bootstrap - value[row][step][column]
+                later = delta + (0.0 if done[row][step][0] else gamma * lmbda * later)
+                advantage[row, step, column] = later
+    return advantage
+
+
+def make_gae(value_network=None, gamma=GAMMA, lmbda=LMBDA, **kwargs):
+    return CostGAE(gamma=gamma, lmbda=lmbda, value_network=value_network, **kwargs)
+
+
+@pytest.mark.parametrize("vectorized", [True, False], ids=["vectorized", "loop"])
+def test_equals_the_recursion(num_costs, vectorized):
+    batch = with_values(num_costs)
+    make_gae(average_gae=False, vectorized=vectorized)(batch)
+    expected = recursion(batch)
+    torch.testing.assert_close(batch["cost_advantage"], expected)
+    torch.testing.assert_close(batch["cost_value_target"], expected + batch["cost_value"])
+
+
+def test_one_row_by_hand():
+    # gamma = lmbda = 0.5, so the trace decays by 0.25; step 0 is truncated, step 2 terminates:
+    #   step 2: delta = 4 - 1               = 3       A = 3
+    #   step 1: delta = 2 + 0.5 * 1 - 2     = 0.5     A = 0.5 + 0.25 * 3 = 1.25
+    #   step 0: delta = 1 + 0.5 * 10 - 2    = 4       A = 4, whatever comes after the reset
+    column = torch.tensor
+    batch = TensorDict(
+        cost_value=column([[2.0], [2.0], [1.0]]),
+        next=TensorDict(
+            cost=column([[1.0], [2.0], [4.0]]),
+            cost_value=column([[10.0], [1.0], [100.0]]),
+            done=column([[True], [False], [True]]),
+            terminated=column([[False], [False], [True]]),
+            batch_size=[3],
+        ),
+        batch_size=[3],
+    )
+    make_gae(gamma=0.5, lmbda=0.5, average_gae=False)(batch)
+    torch.testing.assert_close(batch["cost_advantage"], column([[4.0], [1.25], [3.0]]))
+
+
+def test_vectorized_by_default_and_equal_to_the_loop(num_costs):
+    gae = make_gae()
+    assert gae.vectorized
+    vectorized = gae(with_values(num_costs))
+    loop = make_gae(vectorized=False)(with_values(num_costs))
+    torch.testing.assert_close(vectorized["cost_advantage"], loop["cost_advantage"])
+    torch.testing.assert_close(vectorized["cost_value_target"], loop["cost_value_target"])
+
+
+def test_truncation_bootstraps_from_the_true_next_observation(num_costs):
+    critic = make_critic("cost_value", num_costs)
+    gae = make_gae(critic, average_gae=False)
+    batch, truncated_row = make_batch(num_costs), (2, 3)
+    assert batch["next", "truncated"][truncated_row]
+    gae(batch)
+    with torch.no_grad():
+        value = critic(batch.select("observation"))["cost_value"]
+        next_value = critic(batch["next"].select("observation"))["cost_value"]
+    # The trace ends here: one-step error with the value of the observation before the reset.
+    expected = batch["next", "cost"] + GAMMA * next_value - value
+    torch.testing.assert_close(batch["cost_advantage"][truncated_row], expected[truncated_row])
+
+    # Moving that observation moves this advantage; where the episode terminated it does not.
+    moved = make_batch(num_costs)
+    moved["next", "observation"] = moved["next", "observation"] + 1.0
+    gae(moved)
+    changed = (moved["cost_advantage"] - batch["cost_advantage"]).abs()
+    assert (changed[truncated_row] > 1e-4).all()
+    assert (changed[1, 2] == 0).all()
+    assert batch["next", "terminated"][1, 2]
+
+
+def test_centred_but_not_scaled(num_costs):
+    raw = make_gae(average_gae=False)(with_values(num_costs))["cost_advantage"].flatten(0, 1)
+    centred = make_gae()(with_values(num_costs))["cost_advantage"].flatten(0, 1)
+    # The raw means differ from zero and from each other: centring has something to do.
+    assert (raw.mean(0).abs() > 0.05).all()
+    torch.testing.assert_close(centred.mean(0), torch.zeros(num_costs), atol=1e-6, rtol=0)
+    torch.testing.assert_close(centred.std(0), raw.std(0))
+    torch.testing.assert_close(centred, raw - raw.mean(0))
+
+
+def test_centring_leaves_the_value_target_alone(num_costs):
+    raw = make_gae(average_gae=False)(with_values(num_costs))
+    centred = make_gae()(with_values(num_costs))
+    assert torch.equal(raw["cost_value_target"], centred["cost_value_target"])
+
+
+def test_centres_over_valid_steps_only():
+    """``shifted`` marks displaced steps invalid: they count for no mean and hold zero."""
+    critic = make_critic("cost_value", 3)
+    batch = make_gae(critic, shifted=True)(make_batch(3))
+    valid = batch["shifted_valid"]
+    assert not valid.all()
+    advantage = batch["cost_advantage"]
+    torch.testing.assert_close(advantage[valid].mean(0), torch.zeros(3), atol=1e-6, rtol=0)
+    assert (advantage[~valid] == 0).all()
+    exact = make_gae(critic, average_gae=False)(make_batch(3))["cost_advantage"]
+    # Row 0 never ends, so it displaces nothing: it equals the two-call path up to the centring.
+    difference = advantage[0] - exact[0]
+    torch.testing.assert_close(difference, difference[:1].expand_as(difference))
+
+
+@pytest.mark.parametrize(
+    ("num_costs", "num_values"), [(1, 3), (3, 1), (3, 2)], ids=lambda width: str(width)
+)
+def test_wrong_width_is_refused(num_costs, num_values):
+    batch = make_batch(num_costs)
+    gae = make_gae(make_critic("cost_value", num_values))
+    shapes = f"{re.escape(str((4, 6, num_costs)))}.*{re.escape(str((4, 6, num_values)))}"
+    with pytest.raises(ValueError, match=f"'cost'.*'cost_value'.*{shapes}"):
+        gae(batch)
+
+
+def test_nested_keys(num_costs):
+    keys = {
+        "advantage": ("safety", "advantage"),
+        "value_target": ("safety", "target"),
+        "value": ("safety", "value"),
+        "reward": ("safety", "cost"),
+        "done": ("ended", "done"),
+        "terminated": ("ended", "terminated"),
+    }
+    expected = make_gae()(with_values(num_costs))
+    batch = with_values(num_costs)
+    batch.rename_key_("cost_value", keys["value"])
+    for old, new in {"cost_value": "value", "cost": "reward"}.items():
+        batch["next"].rename_key_(old, keys[new])
+    for flag in ("done", "terminated"):
+        batch["next"].rename_key_(flag, keys[flag])
+    gae = make_gae()
+    gae.set_keys(**keys)
+    gae(batch)
+    assert torch.equal(batch["safety", "advantage"], expected["cost_advantage"])
+    assert torch.equal(batch["safety", "target"], expected["cost_value_target"])
+
+
+def test_unknown_key_is_refused():
+    with pytest.raises(KeyError, match="cost_limit"):
+        make_gae().set_keys(cost_limit="anything")
+
+
+def test_group_key_is_refused():
+    with pytest.raises(ValueError, match="group_key"):
+        make_gae(group_key="task")
+
+
+def test_dispatch_equals_the_tensordict_call(num_costs):
+    critic = make_critic("cost_value", num_costs)
+    batch = make_batch(num_costs)
+    advantage, target = make_gae(critic)(
+        observation=batch["observation"],
+        next_observation=batch["next", "observation"],
+        next_cost=batch["next", "cost"],
+        next_done=batch["next", "done"],
+        next_terminated=batch["next", "terminated"],
+    )
+    expected = make_gae(critic)(batch)
+    torch.testing.assert_close(advantage, expected["cost_advantage"])
+    torch.testing.assert_close(target, expected["cost_value_target"])

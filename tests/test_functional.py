@@ -1,0 +1,75 @@
+"""The mixed advantage, against numbers worked out by hand."""
+
+import re
+
+import pytest
+import torch
+
+from torchrl_safe.objectives import penalized_advantage
+
+
+def test_one_cost_by_hand():
+    # (1 - 0.5 * 3) / 1.5 = -1/3 and (-2 - 0.5 * -1) / 1.5 = -1
+    mixed = penalized_advantage(
+        torch.tensor([[1.0], [-2.0]]), torch.tensor([[3.0], [-1.0]]), torch.tensor([0.5])
+    )
+    torch.testing.assert_close(mixed, torch.tensor([[-1 / 3], [-1.0]]))
+
+
+def test_three_costs_by_hand():
+    # (10 - (1 * 1 + 2 * 2 + 0 * 100)) / (1 + 3) = 1.25
+    # ( 0 - (1 * -1 + 2 * 0.5 + 0 * -7)) / (1 + 3) = 0
+    mixed = penalized_advantage(
+        torch.tensor([[10.0], [0.0]]),
+        torch.tensor([[1.0, 2.0, 100.0], [-1.0, 0.5, -7.0]]),
+        torch.tensor([1.0, 2.0, 0.0]),
+    )
+    torch.testing.assert_close(mixed, torch.tensor([[1.25], [0.0]]))
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (4, 6)], ids=["no-batch", "flat", "rows-and-time"])
+@pytest.mark.parametrize("num_costs", [1, 3])
+def test_zero_multiplier_gives_the_reward_advantage_exactly(batch, num_costs):
+    torch.manual_seed(0)
+    advantage = torch.randn(*batch, 1)
+    mixed = penalized_advantage(advantage, torch.randn(*batch, num_costs), torch.zeros(num_costs))
+    assert torch.equal(mixed, advantage)
+
+
+def test_large_multiplier_follows_the_cost():
+    torch.manual_seed(0)
+    advantage, cost_advantage = torch.randn(50, 1), torch.randn(50, 2)
+    mixed = penalized_advantage(advantage, cost_advantage, torch.tensor([0.0, 1e7]))
+    torch.testing.assert_close(mixed, -cost_advantage[:, 1:], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("advantage", "cost_advantage", "multiplier"),
+    [
+        pytest.param((5, 1), (5, 2), (3,), id="a-column-too-few"),
+        pytest.param((5, 1), (5, 2), (1,), id="one-multiplier-for-two-costs"),
+        pytest.param((5, 1), (5, 1), (), id="multiplier-without-dimension"),
+        pytest.param((5, 1), (5, 2), (5, 2), id="multiplier-for-each-row"),
+    ],
+)
+def test_multiplier_and_cost_must_agree(advantage, cost_advantage, multiplier):
+    named = f"{re.escape(str(cost_advantage))}.*{re.escape(str(multiplier))}"
+    with pytest.raises(ValueError, match=named):
+        penalized_advantage(
+            torch.zeros(advantage), torch.zeros(cost_advantage), torch.zeros(multiplier)
+        )
+
+
+@pytest.mark.parametrize(
+    ("advantage", "cost_advantage"),
+    [
+        pytest.param((5,), (5, 2), id="flat-advantage"),
+        pytest.param((5, 2), (5, 2), id="advantage-with-two-columns"),
+        pytest.param((4, 1), (5, 2), id="another-batch"),
+        pytest.param((1, 1), (5, 2), id="advantage-that-would-broadcast"),
+    ],
+)
+def test_advantage_and_cost_must_agree(advantage, cost_advantage):
+    named = f"{re.escape(str(advantage))}.*{re.escape(str(cost_advantage))}"
+    with pytest.raises(ValueError, match=named):
+        penalized_advantage(torch.zeros(advantage), torch.zeros(cost_advantage), torch.zeros(2))

@@ -1,0 +1,339 @@
+"""The multiplier updaters, against hand numbers and against the published formulas."""
+
+import copy
+import math
+import re
+
+import pytest
+import torch
+from networks import make_loss
+from torch.distributions.transforms import SoftplusTransform
+from torchrl.objectives import LossModule
+
+from torchrl_safe.objectives import DualAscent, MultiplierUpdater
+
+NAN, INF = float("nan"), float("inf")
+
+
+def make_module(*multiplier):
+    """The least a loss must have to be updated."""
+    module = LossModule()
+    module.register_buffer("lagrange_multiplier", torch.tensor(multiplier))
+    return module
+
+
+def episodes(*mean_costs):
+    """Two episodes whose mean costs are the given ones."""
+    mean = torch.tensor(mean_costs)
+    return torch.stack([mean - 0.5, mean + 0.5])
+
+
+# ---------------------------------------------------------------- the step
+
+
+@pytest.mark.parametrize("violation", [2.0, 4.0, -0.5], ids=["two", "four", "safe"])
+def test_step_is_proportional_to_the_violation(violation):
+    module = make_module(1.0)
+    DualAscent(module, cost_limit=10.0, lr=0.1).step(episodes(10.0 + violation))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([1.0 + 0.1 * violation]))
+
+
+def test_three_costs_with_three_limits():
+    # violations 5 - 1 = 4, 5 - 5 = 0, 5 - 7 = -2; times lr 0.25: +1, 0, -0.5
+    module = make_module(0.0, 2.0, 3.0)
+    updater = DualAscent(module, cost_limit=torch.tensor([1.0, 5.0, 7.0]), lr=0.25)
+    updater.step(episodes(5.0, 5.0, 5.0))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([1.0, 2.0, 2.5]))
+
+
+def test_one_limit_holds_for_every_cost():
+    module = make_module(0.0, 0.0)
+    DualAscent(module, cost_limit=1.0, lr=1.0).step(episodes(2.0, 4.0))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([1.0, 3.0]))
+
+
+def test_the_mean_is_over_episodes():
+    module = make_module(0.0)
+    DualAscent(module, cost_limit=0.0, lr=1.0).step(torch.tensor([[0.0], [0.0], [9.0]]))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([3.0]))
+
+
+def test_integer_costs_are_averaged_as_numbers():
+    module = make_module(0.0)
+    DualAscent(module, cost_limit=0.0, lr=1.0).step(torch.tensor([[1], [2]]))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([1.5]))
+
+
+def test_never_negative_and_back_at_once():
+    module = make_module(0.5)
+    updater = DualAscent(module, cost_limit=10.0, lr=1.0)
+    updater.step(episodes(0.0))
+    assert torch.equal(module.lagrange_multiplier, torch.zeros(1))
+    # The overshoot below zero is forgotten: one violated batch is enough to react.
+    updater.step(episodes(11.0))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([1.0]))
+
+
+def test_never_above_the_bound_and_back_at_once():
+    module = make_module(0.0, 0.0)
+    updater = DualAscent(module, cost_limit=0.0, lr=1.0, max_multiplier=2.0)
+    updater.step(episodes(100.0, 1.0))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([2.0, 1.0]))
+    updater.step(torch.tensor([[-1.0, 0.0]]))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([1.0, 1.0]))
+
+
+def test_the_update_is_in_place():
+    loss = make_loss(num_costs=2)
+    address = loss.lagrange_multiplier.data_ptr()
+    DualAscent(loss, cost_limit=0.0, lr=1.0).step(episodes(1.0, 2.0))
+    assert loss.lagrange_multiplier.data_ptr() == address
+    torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([1.0, 2.0]))
+
+
+@pytest.mark.parametrize("optimizer", [torch.optim.SGD, torch.optim.Adam])
+def test_survives_a_cast_of_the_loss(optimizer):
+    loss = make_loss()
+    updater = DualAscent(loss, cost_limit=0.0, lr=0.5, optimizer=optimizer)
+    updater.step(torch.tensor([[1.0]]))
+    loss.to(torch.float64)
+    updater.step(torch.tensor([[1.0]]))
+    assert loss.lagrange_multiplier.dtype == torch.float64
+    torch.testing.assert_close(
+        loss.lagrange_multiplier, torch.tensor([1.0], dtype=torch.float64), atol=1e-6, rtol=0
+    )
+
+
+@pytest.mark.parametrize("optimizer", [torch.optim.SGD, torch.optim.Adam])
+def test_a_multiplier_set_by_hand_is_where_the_next_step_starts(optimizer):
+    loss = make_loss()
+    updater = DualAscent(loss, cost_limit=0.0, lr=0.5, optimizer=optimizer)
+    updater.step(torch.tensor([[1.0]]))
+    loss.lagrange_multiplier = torch.tensor([7.0])
+    updater.step(torch.tensor([[1.0]]))
+    torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([7.5]))
+    loss.lagrange_multiplier.fill_(3.0)
+    updater.step(torch.tensor([[1.0]]))
+    torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([3.5]))
+
+
+# ---------------------------------------------------------------- what must change nothing
+
+
+def snapshot(updater):
+    state = updater.optimizer.state_dict()["state"]
+    values = [value for entry in state.values() for value in entry.values()]
+    multiplier = updater.loss_module.lagrange_multiplier
+    return [multiplier.clone(), *(torch.as_tensor(value).clone() for value in values)]
+
+
+def assert_unchanged(updater, before):
+    after = snapshot(updater)
+    assert len(before) == len(after) > 1
+    for old, new in zip(before, after, strict=True):
+        assert torch.equal(old, new)
+
+
+@pytest.fixture
+def adam():
+    """An updater in the middle of its work, with optimizer state."""
+    updater = DualAscent(make_module(1.0, 1.0), cost_limit=2.0, lr=0.1, optimizer=torch.optim.Adam)
+    updater.step(episodes(5.0, 1.0))
+    return updater
+
+
+def test_no_finished_episode_changes_nothing(adam):
+    before = snapshot(adam)
+    adam.step(torch.zeros(0, 2))
+    assert_unchanged(adam, before)
+
+
+@pytest.mark.parametrize("bad", [NAN, INF, -INF], ids=["nan", "inf", "minus-inf"])
+def test_a_cost_that_is_not_finite_is_refused(adam, bad):
+    before = snapshot(adam)
+    with pytest.raises(ValueError, match="episode_cost must be finite"):
+        adam.step(torch.tensor([[1.0, 1.0], [1.0, bad]]))
+    assert_unchanged(adam, before)
+
+
+@pytest.mark.parametrize(
+    "shape", [(), (2,), (5, 1), (5, 3), (5, 2, 1), (0,)], ids=lambda shape: f"{shape}"
+)
+def test_a_cost_of_the_wrong_shape_is_refused(adam, shape):
+    before = snapshot(adam)
+    named = rf"episode_cost must have shape \(E, 2\), got {re.escape(str(shape))}"
+    with pytest.raises(ValueError, match=named):
+        adam.step(torch.zeros(shape))
+    assert_unchanged(adam, before)
+
+
+# ---------------------------------------------------------------- arguments
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        pytest.param("cost_limit", torch.zeros(3), id="limit-too-many"),
+        pytest.param("cost_limit", torch.zeros(1), id="limit-too-few"),
+        pytest.param("cost_limit", torch.zeros(2, 1), id="limit-two-dimensions"),
+        pytest.param("cost_limit", NAN, id="limit-nan"),
+        pytest.param("cost_limit", torch.tensor([1.0, INF]), id="limit-inf"),
+        pytest.param("lr", 0.0, id="lr-zero"),
+        pytest.param("lr", -0.1, id="lr-negative"),
+        pytest.param("lr", NAN, id="lr-nan"),
+        pytest.param("lr", INF, id="lr-inf"),
+        pytest.param("max_multiplier", 0.0, id="bound-zero"),
+        pytest.param("max_multiplier", -1.0, id="bound-negative"),
+        pytest.param("max_multiplier", NAN, id="bound-nan"),
+    ],
+)
+def test_bad_arguments_are_named(name, value):
+    arguments = {"cost_limit": 1.0, "lr": 0.1, name: value}
+    with pytest.raises(ValueError, match=f"^{name} must"):
+        DualAscent(make_module(0.0, 0.0), **arguments)
+
+
+def test_a_loss_without_the_buffer_is_refused():
+    with pytest.raises(ValueError, match="lagrange_multiplier"):
+        DualAscent(LossModule(), cost_limit=1.0, lr=0.1)
+
+
+def test_anything_but_a_loss_is_refused():
+    module = torch.nn.Module()
+    module.register_buffer("lagrange_multiplier", torch.zeros(1))
+    with pytest.raises(ValueError, match="loss_module must be a LossModule"):
+        DualAscent(module, cost_limit=1.0, lr=0.1)
+
+
+# ---------------------------------------------------------------- state
+
+
+VARIANTS = [
+    pytest.param({}, id="sgd"),
+    pytest.param({"optimizer": torch.optim.Adam}, id="adam"),
+    pytest.param(
+        {"optimizer": torch.optim.Adam, "parametrization": SoftplusTransform()}, id="softplus"
+    ),
+]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_restored_updater_continues_identically(variant):
+    torch.manual_seed(0)
+    costs = 5 * torch.rand(8, 3, 2)
+    limit = torch.tensor([1.0, 4.0])
+    loss = make_loss(num_costs=2, multiplier_init=0.5)
+    updater = DualAscent(loss, cost_limit=limit, lr=0.1, max_multiplier=3.0, **variant)
+    for cost in costs[:4]:
+        updater.step(cost)
+    saved = copy.deepcopy({"loss": loss.state_dict(), "updater": updater.state_dict()})
+
+    # Every argument differs: what follows can only come from the state.
+    restored_loss = make_loss(num_costs=2, multiplier_init=0.1, seed=3)
+    restored = DualAscent(restored_loss, cost_limit=0.0, lr=0.7, **variant)
+    restored_loss.load_state_dict(saved["loss"])
+    restored.load_state_dict(saved["updater"])
+    for cost in costs[4:]:
+        updater.step(cost)
+        restored.step(cost)
+        assert torch.equal(loss.lagrange_multiplier, restored_loss.lagrange_multiplier)
+    assert restored.max_multiplier == 3.0
+    assert torch.equal(restored.cost_limit, limit)
+
+
+def test_the_state_holds_its_own_limit():
+    updater = DualAscent(make_module(0.0), cost_limit=1.0, lr=0.1)
+    state = updater.state_dict()
+    updater.cost_limit.fill_(9.0)
+    assert state["cost_limit"].item() == 1.0
+    updater.load_state_dict(state)
+    updater.cost_limit.fill_(9.0)
+    assert state["cost_limit"].item() == 1.0
+
+
+# ---------------------------------------------------------------- the published variants
+
+
+@pytest.mark.parametrize("violation", [0.01, 1.0, 100.0], ids=["small", "one", "large"])
+def test_the_first_step_of_adam_is_lr_whatever_the_violation(violation):
+    module = make_module(1.0)
+    updater = DualAscent(module, cost_limit=5.0, lr=0.03, optimizer=torch.optim.Adam)
+    updater.step(torch.tensor([[5.0 + violation]]))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([1.03]))
+
+
+def safety_gym(multiplier, costs, limit, lr):
+    """Safety Gym's rule (Ray et al. 2019): Adam on p, loss -p * (J - d), multiplier softplus(p)."""
+    param = math.log(math.expm1(multiplier))
+    mean, square, history = 0.0, 0.0, []
+    for step, cost in enumerate(costs, start=1):
+        gradient = -(cost - limit)
+        mean = 0.9 * mean + 0.1 * gradient
+        square = 0.999 * square + 0.001 * gradient**2
+        corrected = math.sqrt(square / (1 - 0.999**step)) + 1e-8
+        param -= lr * mean / (1 - 0.9**step) / corrected
+        history.append(math.log1p(math.exp(param)))
+    return torch.tensor(history)
+
+
+def test_softplus_with_adam_is_the_rule_of_safety_gym():
+    costs = [40.0, 35.0, 30.0, 22.0, 10.0, 24.0, 26.0, 5.0, 0.0, 60.0]
+    module = make_module(1.0)
+    updater = DualAscent(
+        module,
+        cost_limit=25.0,
+        lr=0.05,
+        optimizer=torch.optim.Adam,
+        parametrization=SoftplusTransform(),
+    )
+    history = []
+    for cost in costs:
+        updater.step(torch.tensor([[cost]]))
+        history.append(module.lagrange_multiplier.item())
+    torch.testing.assert_close(
+        torch.tensor(history), safety_gym(1.0, costs, limit=25.0, lr=0.05), atol=1e-5, rtol=1e-5
+    )
+
+
+def test_softplus_cannot_start_at_zero():
+    with pytest.raises(ValueError, match=r"parametrization Softplus.*\[0\.0, 1\.0\]"):
+        DualAscent(
+            make_module(0.0, 1.0), cost_limit=1.0, lr=0.1, parametrization=SoftplusTransform()
+        )
+
+
+def test_softplus_comes_back_after_underflow():
+    module = make_module(1.0)
+    updater = DualAscent(module, cost_limit=0.0, lr=1.0, parametrization=SoftplusTransform())
+    updater.step(torch.tensor([[-1000.0]]))
+    assert module.lagrange_multiplier.item() == 0.0
+    updater.step(torch.tensor([[90.0]]))
+    # The parameter restarts at its lower bound of -80, so the sum is 10, and softplus(10) = 10.
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([10.0]), atol=1e-4, rtol=0)
+
+
+# ---------------------------------------------------------------- rules written by users
+
+
+class Doubling(MultiplierUpdater):
+    """The least a user writes."""
+
+    def next_multiplier(self, multiplier, violation):
+        return torch.where(violation > 0, 2 * multiplier, multiplier - 1)
+
+
+def test_a_rule_is_one_method():
+    loss = make_loss(num_costs=3, multiplier_init=torch.tensor([1.0, 0.5, 4.0]))
+    updater = Doubling(loss, cost_limit=torch.tensor([1.0, 5.0, 1.0]), max_multiplier=5.0)
+    updater.step(episodes(2.0, 2.0, 2.0))
+    # Doubled; lowered and cut at 0; doubled and cut at 5.
+    torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([2.0, 0.0, 5.0]))
+    other = Doubling(make_loss(num_costs=3), cost_limit=0.0)
+    other.load_state_dict(updater.state_dict())
+    assert torch.equal(other.cost_limit, torch.tensor([1.0, 5.0, 1.0]))
+    assert other.max_multiplier == 5.0
+
+
+def test_a_rule_without_the_method_cannot_be_made():
+    with pytest.raises(TypeError, match="next_multiplier"):
+        MultiplierUpdater(make_module(0.0), cost_limit=1.0)

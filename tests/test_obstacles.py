@@ -1,0 +1,46 @@
+import numpy as np
+import pytest
+
+from torchrl_safe.envs import Cylinder, InFront, NoObstacles
+
+RNG = np.random.default_rng(0)
+
+
+def test_in_front_stands_on_the_way():
+    start, goal = np.array([0.3, 0.1, 0.5]), np.array([0.6, 0.5, 0.2])
+    (centre,) = InFront(gap=0.25, shape=Cylinder(height=0.3)).sample(RNG, start, goal)
+    # The way is (0.3, 0.4) long 0.5: half of it before the goal, on the table.
+    np.testing.assert_allclose(centre, [0.45, 0.3, 0.15])
+
+
+def test_in_front_of_the_paper():
+    layout = InFront(gap=0.2, direction=(1, 0, 0), height=0.05)
+    (centre,) = layout.sample(RNG, np.zeros(3), np.array([0.7, 0.1, 0.05]))
+    np.testing.assert_allclose(centre, [0.5, 0.1, 0.05])
+
+
+def test_sampling_leaves_the_goal_alone():
+    goal = np.array([0.7, 0.1, 0.05])
+    InFront().sample(RNG, np.zeros(3), goal)
+    np.testing.assert_array_equal(goal, [0.7, 0.1, 0.05])
+
+
+def test_no_obstacles():
+    assert NoObstacles().shapes == ()
+    assert NoObstacles().sample(RNG, np.zeros(3), np.ones(3)).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: InFront(gap=0), "gap must be positive, got 0"),
+        (lambda: InFront(direction=(0, 0, 1)), "direction must be horizontal"),
+        (lambda: InFront(direction=(0, 0, 0)), "direction must be horizontal and not zero"),
+        (lambda: Cylinder(radius=-1), "radius and height must be positive, got -1"),
+        (lambda: Cylinder(height=float("nan")), "radius and height must be positive"),
+        (lambda: Cylinder(mass=-1), "mass must not be negative, got -1"),
+    ],
+)
+def test_bad_arguments(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

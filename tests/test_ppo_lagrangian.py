@@ -1,0 +1,787 @@
+"""PPOLagrangianLoss: what it shares with ClipPPOLoss, what it adds, and how it plugs in."""
+
+import copy
+import re
+from functools import partial
+
+import pytest
+import torch
+from networks import OBSERVATION, make_batch, make_critic, make_loss, make_networks, mlp
+from tensordict.nn import (
+    CompositeDistribution,
+    NormalParamExtractor,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+    set_composite_lp_aggregate,
+)
+from tensordict.utils import unravel_key
+from torch import nn
+from torch.nn.functional import smooth_l1_loss
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss, SoftUpdate
+from torchrl.objectives.value import GAE
+
+from torchrl_safe.objectives import CostGAE, DualAscent, PPOLagrangianLoss, penalized_advantage
+
+NETWORKS = ("actor", "critic", "cost_critic")
+# Only these outputs have a gradient, and this is the network each of them trains.
+TRAINS = {
+    "loss_objective": "actor",
+    "loss_entropy": "actor",
+    "loss_critic": "critic",
+    "loss_cost_critic": "cost_critic",
+}
+
+
+def make_clip_loss(seed=0, **kwargs):
+    actor, critic, _ = make_networks(seed=seed)
+    return ClipPPOLoss(actor, critic, **kwargs)
+
+
+def parameters(loss, network):
+    if loss.functional:
+        return list(getattr(loss, f"{network}_network_params").values(True, True))
+    return list(getattr(loss, f"{network}_network").parameters())
+
+
+def gradient(loss, network):
+    return torch.cat([p.grad.flatten() for p in parameters(loss, network)])
+
+
+def networks_with_gradient(loss):
+    def is_reached(p):
+        return p.grad is not None and bool(p.grad.any())
+
+    return {name for name in NETWORKS if any(map(is_reached, parameters(loss, name)))}
+
+
+def assert_same_outputs(actual, expected):
+    """Every output of ``expected`` is in ``actual``, bit for bit."""
+    for key, value in expected.items():
+        assert torch.equal(actual[key], value), key
+
+
+def assert_close_outputs(actual, expected):
+    assert set(actual.keys()) == set(expected.keys())
+    for key, value in expected.items():
+        torch.testing.assert_close(actual[key], value, msg=lambda text, key=key: f"{key}: {text}")
+
+
+def estimated(loss, num_costs=1, seed=1):
+    """A flat batch with both advantages."""
+    return loss.estimate_advantages(make_batch(num_costs, seed)).reshape(-1)
+
+
+# ---------------------------------------------------------------- multiplier zero: ClipPPOLoss
+
+
+OPTIONS = {
+    "default": {},
+    "normalize_advantage": {"normalize_advantage": True},
+    "clip_value": {"clip_value": 0.1},
+    "clip_value_as_epsilon": {"clip_value": True},
+    "asymmetric_clip": {"clip_epsilon": (0.1, 0.3)},
+    "reduction_none": {"reduction": "none"},
+    "reduction_sum": {"reduction": "sum"},
+    "not_functional": {"functional": False},
+    "separate_losses": {"separate_losses": True},
+    "no_entropy": {"entropy_bonus": False},
+    "entropy_coeff": {"entropy_coeff": 0.3},
+    "critic_l2": {"loss_critic_type": "l2"},
+    "critic_coeff": {"critic_coeff": 0.25},
+    "delay_actor": {"delay_actor": True},
+    "max_importance_ratio": {"max_importance_ratio": 1.1},
+}
+
+
+def make_pair(num_costs, **options):
+    pair = make_loss(num_costs, **options), make_clip_loss(**options)
+    if options.get("delay_actor"):
+        for loss in pair:
+            SoftUpdate(loss, eps=0.5)
+            with torch.no_grad():  # A proximal policy that differs from the trained one.
+                for parameter in parameters(loss, "actor"):
+                    parameter.add_(0.05)
+    return pair
+
+
+@pytest.mark.parametrize("num_costs", [1, 3])
+@pytest.mark.parametrize("precomputed", [True, False], ids=["advantages-given", "no-advantages"])
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_multiplier_zero_is_clip_ppo_bit_for_bit(options, precomputed, num_costs):
+    loss, clip_loss = make_pair(num_costs, **options)
+    batch = make_batch(num_costs)
+    if precomputed:
+        batch = loss.estimate_advantages(batch).reshape(-1)
+    losses, expected = loss(batch.clone()), clip_loss(batch.clone())
+    assert_same_outputs(losses, expected)
+    # The data exercise what is compared: ratios are clipped, nothing is zero by accident.
+    assert expected["clip_fraction"] > 0 or "delay_actor" in options
+    assert expected["loss_objective"].abs().max() > 0
+    extra = {"loss_cost_critic", "cost_explained_variance"}
+    extra |= {f"lagrange_multiplier_{index}" for index in range(num_costs)}
+    extra |= {"cost_value_clip_fraction"} if "clip_value" in options else set()
+    assert set(losses.keys()) == set(expected.keys()) | extra
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"normalize_advantage": True, "clip_value": 0.1}, {"functional": False}],
+    ids=["default", "normalized-and-clipped", "not-functional"],
+)
+def test_multiplier_zero_trains_like_clip_ppo_bit_for_bit(options):
+    loss, clip_loss = make_loss(2, **options), make_clip_loss(**options)
+    before = [p.detach().clone() for p in parameters(loss, "cost_critic")]
+    start = [p.detach().clone() for p in parameters(loss, "actor")]
+    data = estimated(make_loss(2), 2)
+    for trained in (loss, clip_loss):
+        optimizer = torch.optim.Adam(trained.parameters(), lr=1e-2)
+        order = torch.Generator().manual_seed(3)
+        for _ in range(20):
+            minibatch = data[torch.randperm(len(data), generator=order)[:8]]
+            losses = trained(minibatch)
+            sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+    for network in ("actor", "critic"):
+        pairs = zip(parameters(loss, network), parameters(clip_loss, network), strict=True)
+        assert all(torch.equal(ours, theirs) for ours, theirs in pairs)
+    for old, now in ((start, "actor"), (before, "cost_critic")):
+        assert not any(map(torch.equal, old, parameters(loss, now)))
+
+
+# ---------------------------------------------------------------- the mixed objective
+
+
+@pytest.mark.parametrize("normalize", [False, True], ids=["as-given", "normalize_advantage"])
+def test_three_costs_mix_into_one_advantage(normalize):
+    multiplier = torch.tensor([0.5, 0.0, 2.0])
+    loss = make_loss(3, multiplier_init=multiplier, normalize_advantage=normalize)
+    data = estimated(loss, 3)
+    advantage = data["advantage"] = 3 * data["advantage"] + 1
+    if normalize:  # The reward advantage is normalized, then mixed: never the mixture.
+        advantage = (advantage - advantage.mean()) / advantage.std()
+    losses = loss(data)
+    data["advantage"] = penalized_advantage(advantage, data["cost_advantage"], multiplier)
+    expected = make_clip_loss()(data)
+    assert_close_outputs(losses.select(*expected.keys()), expected)
+
+
+@pytest.mark.parametrize("column", [0, 2])
+def test_a_very_large_multiplier_minimizes_its_cost(column):
+    loss, clip_loss = make_loss(3), make_clip_loss()
+    data = estimated(loss, 3)
+    loss.lagrange_multiplier[column] = 1e7
+    loss(data)["loss_objective"].backward()
+    data["advantage"] = -data["cost_advantage"][:, column : column + 1]
+    clip_loss(data)["loss_objective"].backward()
+    ours, theirs = gradient(loss, "actor"), gradient(clip_loss, "actor")
+    assert theirs.norm() > 1e-3
+    torch.testing.assert_close(ours / ours.norm(), theirs / theirs.norm(), atol=1e-4, rtol=1e-4)
+
+
+def test_the_multiplier_means_the_same_in_every_minibatch():
+    loss = make_loss(3, multiplier_init=torch.tensor([2.0, 0.0, 0.5]))
+    data = estimated(loss, 3)
+    whole = loss(data)
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))
+    parts = [loss(data[rows]) for rows in order.split(len(data) // 4)]
+    for key in TRAINS:
+        mean = torch.stack([part[key] for part in parts]).mean()
+        torch.testing.assert_close(mean, whole[key])
+
+
+# ---------------------------------------------------------------- advantages
+
+
+@pytest.mark.parametrize("num_costs", [1, 3])
+def test_reward_is_standardized_and_costs_are_centred_over_the_whole_batch(num_costs):
+    loss = make_loss(num_costs)
+    batch = make_batch(num_costs)
+    assert loss.estimate_advantages(batch) is batch
+    raw = make_batch(num_costs)
+    _, critic, cost_critic = make_networks(num_costs)
+    with torch.no_grad():
+        GAE(gamma=0.99, lmbda=0.95, value_network=critic)(raw)
+        CostGAE(gamma=0.99, lmbda=0.95, value_network=cost_critic, average_gae=False)(raw)
+    reward, cost = raw["advantage"], raw["cost_advantage"]
+    torch.testing.assert_close(batch["advantage"], (reward - reward.mean()) / reward.std())
+    torch.testing.assert_close(batch["cost_advantage"], cost - cost.mean((0, 1)))
+    # The whole batch, not each row; and the costs keep a spread of their own.
+    assert (batch["cost_advantage"].mean(1).abs() > 1e-3).all()
+    assert ((batch["cost_advantage"].flatten(0, 1).std(0) - 1).abs() > 0.02).all()
+    for key in ("value_target", "cost_value_target"):
+        torch.testing.assert_close(batch[key], raw[key])
+    assert not any(value.requires_grad for value in batch.values(True, True))
+
+
+def test_estimating_changes_nothing_else_in_the_batch():
+    loss, batch = make_loss(2), make_batch(2)
+    loss.estimate_advantages(batch)
+    untouched = make_batch(2)
+    assert (batch.select(*untouched.keys(True, True)) == untouched).all()
+    assert batch.names == [None, "time"]
+
+
+@pytest.mark.parametrize("parameter", ["gamma", "lmbda"])
+@pytest.mark.parametrize("moved", ["advantage", "cost_advantage"])
+def test_discount_and_trace_decay_act_on_their_own_advantage_only(moved, parameter):
+    loss = make_loss(2)
+    before = loss.estimate_advantages(make_batch(2))
+    if moved == "advantage":
+        loss.make_value_estimator(**{parameter: 0.5})
+    else:
+        loss.make_cost_value_estimator(**{parameter: 0.5})
+    after = loss.estimate_advantages(make_batch(2))
+    for key, target in (("advantage", "value_target"), ("cost_advantage", "cost_value_target")):
+        for name in (key, target):
+            change = (after[name] - before[name]).abs()
+            assert (change.max() > 0.05) if key == moved else (change == 0).all()
+
+
+def test_the_cost_discount_is_the_one_asked_for():
+    loss = make_loss(2).make_cost_value_estimator(gamma=0.5, lmbda=0.25)
+    batch, expected = loss.estimate_advantages(make_batch(2)), make_batch(2)
+    _, _, cost_critic = make_networks(2)
+    with torch.no_grad():
+        CostGAE(gamma=0.5, lmbda=0.25, value_network=cost_critic)(expected)
+    torch.testing.assert_close(batch["cost_advantage"], expected["cost_advantage"])
+
+
+def test_an_estimator_can_be_passed():
+    loss = make_loss()
+    loss.set_keys(cost_advantage="renamed")
+    estimator = GAE(gamma=0.9, lmbda=0.5, value_network=loss.cost_critic_network)
+    loss.make_cost_value_estimator(estimator)
+    assert loss.cost_value_estimator is estimator
+    batch = loss.estimate_advantages(make_batch())
+    expected = make_batch()
+    _, _, cost_critic = make_networks()
+    with torch.no_grad():
+        CostGAE(gamma=0.9, lmbda=0.5, value_network=cost_critic, average_gae=False)(expected)
+    torch.testing.assert_close(batch["renamed"], expected["cost_advantage"])
+
+
+def test_estimator_and_hyperparameters_exclude_each_other():
+    estimator = CostGAE(gamma=0.9, lmbda=0.5, value_network=None)
+    with pytest.raises(ValueError, match="'gamma'"):
+        make_loss().make_cost_value_estimator(estimator, gamma=0.9)
+
+
+# ---------------------------------------------------------------- the cost critic's loss
+
+
+def cost_values(data, num_costs):
+    _, _, cost_critic = make_networks(num_costs)
+    return cost_critic(data.select("observation"))["cost_value"]
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_cost_critic_loss_is_the_sum_over_costs(reduction):
+    loss = make_loss(3, cost_critic_coeff=0.5, reduction=reduction)
+    data = estimated(loss, 3)
+    value, target = cost_values(data, 3), data["cost_value_target"]
+    each = 0.5 * smooth_l1_loss(value, target, reduction="none").sum(-1)
+    expected = {"mean": each.mean(), "sum": each.sum(), "none": each}[reduction]
+    torch.testing.assert_close(loss(data)["loss_cost_critic"], expected)
+
+
+def test_cost_values_are_clipped_like_values():
+    loss = make_loss(3, clip_value=0.1)
+    data = estimated(loss, 3)
+    old = data["cost_value"] = data["cost_value"] + 0.2 * torch.randn(len(data), 3)
+    value, target = cost_values(data, 3), data["cost_value_target"]
+    clipped = old + (value - old).clamp(-0.1, 0.1)
+    worst = torch.maximum(
+        smooth_l1_loss(value, target, reduction="none"),
+        smooth_l1_loss(clipped, target, reduction="none"),
+    )
+    losses = loss(data)
+    torch.testing.assert_close(losses["loss_cost_critic"], worst.sum(-1).mean())
+    fraction = ((value - old).abs() > 0.1).float().mean()
+    assert 0 < fraction < 1
+    torch.testing.assert_close(losses["cost_value_clip_fraction"], fraction)
+
+
+def test_cost_explained_variance_is_the_mean_over_costs():
+    loss = make_loss(3)
+    data = estimated(loss, 3)
+    error = data["cost_value_target"] - cost_values(data, 3)
+    expected = (1 - error.var(0) / data["cost_value_target"].var(0)).mean()
+    torch.testing.assert_close(loss(data)["cost_explained_variance"], expected.detach())
+
+
+def test_coefficient_can_be_scheduled():
+    loss = make_loss()
+    data = estimated(loss)
+    whole = loss(data)["loss_cost_critic"]
+    loss.cost_critic_coeff = 0.25
+    torch.testing.assert_close(loss(data)["loss_cost_critic"], 0.25 * whole)
+    assert "cost_critic_coeff" in loss.state_dict()
+
+
+def test_masked_steps_do_not_count():
+    loss = make_loss(2, multiplier_init=1.0)
+    data = estimated(loss, 2)
+    kept = torch.arange(len(data)) % 3 != 0
+    expected = loss(data[kept])
+    data["collector", "mask"] = kept.unsqueeze(-1)
+    data["cost_value_target"][~kept] = 1e6
+    losses = loss(data)
+    for key in TRAINS:
+        torch.testing.assert_close(losses[key], expected[key])
+
+
+# ---------------------------------------------------------------- gradients
+
+
+@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
+@pytest.mark.parametrize("precomputed", [True, False], ids=["advantages-given", "no-advantages"])
+@pytest.mark.parametrize("name", TRAINS)
+def test_each_loss_trains_one_network(name, precomputed, functional):
+    loss = make_loss(2, multiplier_init=0.7, functional=functional)
+    batch = estimated(loss, 2) if precomputed else make_batch(2)
+    losses = loss(batch)
+    assert {key for key, value in losses.items() if value.requires_grad} == set(TRAINS)
+    losses[name].sum().backward()
+    assert networks_with_gradient(loss) == {TRAINS[name]}
+
+
+def make_shared(num_costs=2, **kwargs):
+    """A loss whose three networks share their first layer, and that layer."""
+    torch.manual_seed(0)
+    trunk = TensorDictModule(nn.Linear(OBSERVATION, 8), ["observation"], ["hidden"])
+    policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
+    actor = ProbabilisticTensorDictSequential(
+        trunk,
+        TensorDictModule(policy, ["hidden"], ["loc", "scale"]),
+        ProbabilisticTensorDictModule(
+            in_keys=["loc", "scale"],
+            out_keys=["action"],
+            distribution_class=IndependentNormal,
+            return_log_prob=True,
+        ),
+    )
+    critic = TensorDictSequential(trunk, ValueOperator(nn.Linear(8, 1), in_keys=["hidden"]))
+    cost_critic = TensorDictSequential(
+        trunk, ValueOperator(nn.Linear(8, num_costs), in_keys=["hidden"], out_keys=["cost_value"])
+    )
+    loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=num_costs, **kwargs)
+    return loss, trunk.module
+
+
+@pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
+@pytest.mark.parametrize("name", TRAINS)
+def test_only_the_policy_trains_a_shared_trunk_with_separate_losses(name, separate):
+    loss, trunk = make_shared(separate_losses=separate)
+    names = [name for name, _ in loss.named_parameters()]
+    assert len(names) == len({id(p) for p in loss.parameters()}) == 2 + 3 * 2
+    losses = loss(estimated(loss, 2))
+    losses[name].backward()
+    reached = trunk.weight.grad is not None and bool(trunk.weight.grad.any())
+    # The entropy of this policy depends on its scale alone, which depends on the trunk.
+    assert reached == (TRAINS[name] == "actor" or not separate)
+
+
+def test_separate_losses_change_no_value():
+    joint, _ = make_shared()
+    separate, _ = make_shared(separate_losses=True)
+    data = estimated(joint, 2)
+    assert_same_outputs(separate(data), joint(data))
+
+
+# ---------------------------------------------------------------- the multiplier
+
+
+def test_the_multiplier_is_a_buffer_and_no_parameter():
+    loss = make_loss(2, multiplier_init=1.5)
+    assert "lagrange_multiplier" in dict(loss.named_buffers())
+    assert not any("multiplier" in name for name, _ in loss.named_parameters())
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1.0)
+    losses = loss(estimated(loss, 2))
+    sum(losses[key] for key in TRAINS).backward()
+    optimizer.step()
+    assert loss.lagrange_multiplier.tolist() == [1.5, 1.5]
+    assert loss.lagrange_multiplier.grad is None
+
+
+def test_multipliers_are_reported_as_scalars_of_their_own():
+    loss = make_loss(3, multiplier_init=torch.tensor([0.1, 0.2, 0.3]))
+    losses = loss(estimated(loss, 3))
+    loss.lagrange_multiplier.fill_(9.0)
+    reported = torch.stack([losses[f"lagrange_multiplier_{index}"] for index in range(3)])
+    torch.testing.assert_close(reported, torch.tensor([0.1, 0.2, 0.3]))
+
+
+@pytest.mark.parametrize("init", [0.5, torch.tensor(0.5), torch.full((2,), 0.5)])
+def test_multiplier_init_is_one_number_or_one_for_each_cost(init):
+    loss = make_loss(2, multiplier_init=init)
+    loss.lagrange_multiplier.add_(1.0)
+    assert loss.lagrange_multiplier.tolist() == [1.5, 1.5]
+    assert torch.as_tensor(init).eq(0.5).all()
+
+
+@pytest.mark.parametrize(
+    "init",
+    [-0.1, float("nan"), float("inf"), torch.tensor([1.0, -1.0])],
+    ids=["negative", "nan", "inf", "one-negative"],
+)
+def test_multiplier_init_must_be_finite_and_not_negative(init):
+    with pytest.raises(ValueError, match="multiplier_init must be finite and not negative"):
+        make_loss(2, multiplier_init=init)
+
+
+@pytest.mark.parametrize("shape", [(1,), (3,), (2, 1)], ids=str)
+def test_multiplier_init_must_have_one_number_for_each_cost(shape):
+    with pytest.raises(ValueError, match=rf"multiplier_init.* 2 costs.*{re.escape(str(shape))}"):
+        make_loss(2, multiplier_init=torch.ones(shape))
+
+
+@pytest.mark.parametrize("num_costs", [0, -1])
+def test_there_is_at_least_one_cost(num_costs):
+    with pytest.raises(ValueError, match=f"num_costs must be at least 1, got {num_costs}"):
+        PPOLagrangianLoss(*make_networks(), num_costs=num_costs)
+
+
+# ---------------------------------------------------------------- data that do not fit
+
+
+@pytest.mark.parametrize("call", ["forward", "estimate_advantages"])
+def test_a_batch_without_cost_is_refused(call):
+    loss = make_loss()
+    with pytest.raises(KeyError, match=r"\('next', 'cost'\)"):
+        getattr(loss, call)(make_batch().exclude(("next", "cost")))
+
+
+@pytest.mark.parametrize("key", ["cost_value", "cost_value_target"])
+def test_what_the_cost_critic_needs_is_named_when_missing(key):
+    loss = make_loss(clip_value=0.1)
+    data = estimated(loss)
+    with pytest.raises(KeyError, match=f"'{key}'"):
+        loss(data.exclude(key))
+
+
+@pytest.mark.parametrize("call", ["forward", "estimate_advantages"])
+def test_a_cost_critic_of_the_wrong_width_is_refused(call):
+    actor, critic, _ = make_networks()
+    loss = PPOLagrangianLoss(actor, critic, make_critic("cost_value", 2), num_costs=3)
+    with pytest.raises(ValueError, match=r"\(4, 6, 3\) and \(4, 6, 2\)"):
+        getattr(loss, call)(make_batch(3))
+
+
+def test_a_loss_of_the_wrong_width_is_refused():
+    loss = PPOLagrangianLoss(*make_networks(3), num_costs=2)
+    with pytest.raises(ValueError, match=r"\(24, 3\) and lagrange_multiplier of shape \(2,\)"):
+        loss(estimated(loss, 3))
+
+
+# ---------------------------------------------------------------- keys
+
+
+DEFAULT_KEYS = {
+    "advantage": "advantage",
+    "value_target": "value_target",
+    "value": "state_value",
+    "reward": "reward",
+    "done": "done",
+    "terminated": "terminated",
+    "cost": "cost",
+    "cost_value": "cost_value",
+    "cost_advantage": "cost_advantage",
+    "cost_value_target": "cost_value_target",
+}
+FROM_THE_BATCH = {"reward", "done", "terminated", "cost"}
+
+
+def run_with_keys(keys, **kwargs):
+    """Outputs and batch with the entries named as in ``keys``."""
+    names = {**DEFAULT_KEYS, **keys}
+    networks = make_networks(2, value=names["value"], cost_value=names["cost_value"])
+    loss = PPOLagrangianLoss(*networks, num_costs=2, multiplier_init=0.7, clip_value=0.1, **kwargs)
+    loss.set_keys(**keys)
+    batch = make_batch(2)
+    for key in FROM_THE_BATCH & keys.keys():
+        batch["next"].rename_key_(DEFAULT_KEYS[key], keys[key])
+    loss.estimate_advantages(batch)
+    return loss(batch.reshape(-1)), batch
+
+
+@pytest.mark.parametrize("name", ["renamed", ("nested", "renamed")], ids=["renamed", "nested"])
+@pytest.mark.parametrize("key", DEFAULT_KEYS)
+def test_any_key_can_be_renamed(key, name):
+    losses, batch = run_with_keys({key: name})
+    expected, _ = run_with_keys({})
+    assert_same_outputs(losses, expected)
+    assert (("next", name) if key in FROM_THE_BATCH else name) in batch
+    assert DEFAULT_KEYS[key] not in batch
+
+
+@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
+def test_all_keys_can_be_nested_at_once(functional):
+    # GAE stacks root and next: a value may not share its parent with an entry of next alone.
+    parents = {key: "info" if key in FROM_THE_BATCH else "estimates" for key in DEFAULT_KEYS}
+    keys = {key: (parent, "deeper", key) for key, parent in parents.items()}
+    losses, batch = run_with_keys(keys, functional=functional)
+    expected, _ = run_with_keys({}, functional=functional)
+    assert_same_outputs(losses, expected)
+    assert not set(batch.keys()) & set(DEFAULT_KEYS)
+
+
+def test_keys_can_be_set_one_by_one_whatever_the_critics_write():
+    loss = PPOLagrangianLoss(*make_networks(2, "v", ("costs", "v")), num_costs=2)
+    loss.set_keys(cost_value=("costs", "v"))
+    loss.set_keys(value="v")
+    assert {"v", ("costs", "v")} <= set(loss.estimate_advantages(make_batch(2)).keys(True))
+
+
+def test_default_keys_and_back():
+    loss = make_loss(2)
+    loss.estimate_advantages(make_batch(2))  # Estimators exist from here on.
+    for key, default in DEFAULT_KEYS.items():
+        assert getattr(loss.tensor_keys, key) == default
+    for key in ("cost", "cost_advantage", "cost_value_target"):
+        loss.set_keys(**{key: "renamed"})
+        assert getattr(loss.tensor_keys, key) == "renamed"
+    assert loss.cost_value_estimator.tensor_keys.reward == "renamed"
+    loss.set_keys(**dict.fromkeys(DEFAULT_KEYS))
+    for key, default in DEFAULT_KEYS.items():
+        assert getattr(loss.tensor_keys, key) == default
+    batch = loss.estimate_advantages(make_batch(2))
+    assert {"cost_advantage", "cost_value_target"} <= set(batch.keys())
+
+
+def test_an_unknown_key_is_refused():
+    with pytest.raises(ValueError, match="cost_limit is not an accepted"):
+        make_loss().set_keys(cost_limit="anything")
+
+
+def test_in_keys_follow_the_keys():
+    loss = make_loss()
+    assert ("next", "cost") in loss.in_keys
+    assert len(loss.in_keys) == len(set(loss.in_keys))
+    loss.set_keys(cost=("info", "cost"))
+    assert ("next", "info", "cost") in loss.in_keys
+    assert ("next", "cost") not in loss.in_keys
+
+
+def test_in_keys_hold_what_only_the_cost_critic_reads():
+    actor, critic, _ = make_networks()
+    cost_critic = make_critic("cost_value", observation=("privileged", "state"))
+    loss = PPOLagrangianLoss(actor, critic, cost_critic)
+    expected = {("privileged", "state"), ("next", "privileged", "state"), "observation"}
+    assert expected <= set(loss.in_keys)
+
+
+def by_keyword(loss, batch):
+    keys = {"_".join(k) if isinstance(k, tuple) else k: k for k in map(unravel_key, loss.in_keys)}
+    return {name: batch[key] for name, key in keys.items()}
+
+
+@pytest.mark.parametrize("options", [{}, {"clip_value": 0.1, "entropy_bonus": False}], ids=str)
+def test_call_with_keywords_equals_call_with_tensordict(options):
+    loss, batch = make_loss(2, multiplier_init=0.7, **options), make_batch(2)
+    expected = loss(batch)
+    outputs = loss(**by_keyword(loss, batch))
+    assert len(outputs) == len(loss.out_keys)
+    for key, output in zip(loss.out_keys, outputs, strict=True):
+        torch.testing.assert_close(output, expected[key])
+    # All that the call returns is announced, but for one that ClipPPOLoss does not announce.
+    assert set(expected.keys()) - set(loss.out_keys) == {"explained_variance"}
+
+
+def test_select_out_keys():
+    loss, batch = make_loss(2), make_batch(2)
+    expected = loss(batch)
+    loss.select_out_keys("loss_cost_critic", "lagrange_multiplier_1")
+    assert loss.out_keys == ["loss_cost_critic", "lagrange_multiplier_1"]
+    cost_critic, multiplier = loss(**by_keyword(loss, batch))
+    torch.testing.assert_close(cost_critic, expected["loss_cost_critic"])
+    torch.testing.assert_close(multiplier, expected["lagrange_multiplier_1"])
+
+
+# ---------------------------------------------------------------- state, casts, copies
+
+
+@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
+@pytest.mark.parametrize("used", ["saved", "loaded"])
+def test_state_goes_between_a_fresh_and_a_used_loss(used, functional):
+    saved = make_loss(2, multiplier_init=1.5, functional=functional)
+    loaded = make_loss(2, seed=5, functional=functional)
+    batch = make_batch(2)
+    {"saved": saved, "loaded": loaded}[used](batch)
+    assert loaded.load_state_dict(saved.state_dict(), strict=True)
+    assert loaded.lagrange_multiplier.tolist() == [1.5, 1.5]
+    assert_same_outputs(loaded(batch), saved(batch))
+
+
+def test_state_includes_the_discounts_and_works_inside_a_module():
+    saved = nn.ModuleList([make_loss(multiplier_init=2.0)])
+    saved[0].make_cost_value_estimator(gamma=0.5)
+    loaded = nn.ModuleList([make_loss()])
+    loaded.load_state_dict(saved.state_dict(), strict=True)
+    assert loaded[0].cost_value_estimator.gamma.item() == 0.5
+    assert loaded[0].lagrange_multiplier.item() == 2.0
+
+
+@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
+@pytest.mark.parametrize("used", [True, False], ids=["used", "fresh"])
+def test_cast_to_double(used, functional):
+    loss = make_loss(2, multiplier_init=0.7, clip_value=0.1, functional=functional)
+    expected = loss(estimated(loss, 2)) if used else None
+    loss.to(torch.float64)
+    assert loss.lagrange_multiplier.dtype == torch.float64
+    batch = make_batch(2).apply(lambda x: x.double() if x.is_floating_point() else x)
+    data = loss.estimate_advantages(batch).reshape(-1)
+    assert data["cost_advantage"].dtype == torch.float64
+    losses = loss(data)
+    assert {losses[key].dtype for key in TRAINS} == {torch.float64}
+    if used:
+        for key in TRAINS:
+            torch.testing.assert_close(losses[key].float(), expected[key])
+
+
+@pytest.mark.parametrize("used", [True, False], ids=["used", "fresh"])
+def test_a_copy_is_independent(used):
+    loss, batch = make_loss(2), make_batch(2)
+    if used:
+        loss(batch)
+    twin = copy.deepcopy(loss)
+    assert_same_outputs(twin(batch), loss(batch))
+    twin.lagrange_multiplier.fill_(1.0)
+    assert loss.lagrange_multiplier.tolist() == [0.0, 0.0]
+    assert twin.state_dict().keys() == loss.state_dict().keys()
+
+
+def test_networks_are_functional_like_those_of_clip_ppo():
+    loss = make_loss(2)
+    for name in NETWORKS:
+        assert f"{name}_network" not in dict(loss.named_children())
+        assert f"{name}_network_params" in dict(loss.named_children())
+    actual = loss.target_cost_critic_network_params.values(True, True)
+    for target, parameter in zip(actual, parameters(loss, "cost_critic"), strict=True):
+        assert torch.equal(target, parameter)
+        assert not target.requires_grad
+    total = sum(p.numel() for network in make_networks(2) for p in network.parameters())
+    assert sum(p.numel() for p in loss.parameters()) == total
+
+
+def test_reset_reinitializes_all_three_networks():
+    loss = make_loss(2)
+    for name in NETWORKS:
+        for parameter in parameters(loss, name):
+            parameter.data.add_(1000.0)
+    loss.reset_parameters_recursive()
+    for name in NETWORKS:
+        for parameter in parameters(loss, name):
+            assert (parameter.abs() < 10).all()
+
+
+# ---------------------------------------------------------------- compilation
+
+
+# tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+def test_compiles_to_one_graph_that_sees_the_multiplier_move():
+    graphs = []
+
+    def eager(graph, inputs):
+        graphs.append(graph)
+        return graph.forward
+
+    torch._dynamo.reset()
+    loss = make_loss(2, multiplier_init=0.5)
+    data = estimated(loss, 2)
+    compiled = torch.compile(loss, fullgraph=True, backend=eager)
+    first = compiled(data)
+    assert_close_outputs(first, loss(data))
+    DualAscent(loss, cost_limit=0.0, lr=1.0).step(torch.tensor([[1.0, 2.0]]))
+    second = compiled(data)
+    assert_close_outputs(second, loss(data))
+    assert second["lagrange_multiplier_1"].item() == 2.5
+    assert (second["loss_objective"] - first["loss_objective"]).abs() > 1e-3
+    assert len(graphs) == 1
+    sum(second[key] for key in TRAINS).backward()
+    assert networks_with_gradient(loss) == set(NETWORKS)
+
+
+# ---------------------------------------------------------------- composite actions
+
+
+@pytest.fixture
+def no_aggregation():
+    """Composite log-probabilities stay apart for the length of a test."""
+    with set_composite_lp_aggregate(False):
+        yield
+
+
+def make_composite(num_costs):
+    """Actor with a continuous and a discrete head, the critics, and a batch."""
+    torch.manual_seed(0)
+
+    class Heads(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.body = mlp(OBSERVATION, 5)
+
+        def forward(self, observation):
+            out = self.body(observation)
+            return out[..., :1], out[..., 1:2].exp(), out[..., 2:]
+
+    params = [("params", "move", "loc"), ("params", "move", "scale"), ("params", "grip", "logits")]
+    actor = ProbabilisticActor(
+        TensorDictModule(Heads(), ["observation"], params),
+        in_keys=["params"],
+        out_keys=["move", "grip"],
+        distribution_class=partial(
+            CompositeDistribution,
+            distribution_map={
+                "move": IndependentNormal,
+                "grip": torch.distributions.Categorical,
+            },
+        ),
+        return_log_prob=True,
+    )
+    batch = make_batch(num_costs).exclude("action", "action_log_prob", "loc", "scale")
+    with torch.no_grad():
+        actor(batch)
+        for key in ("move_log_prob", "grip_log_prob"):  # As of an older policy.
+            batch[key] = batch[key] + 0.2 * torch.randn_like(batch[key])
+    return actor, make_critic(), make_critic("cost_value", num_costs), batch
+
+
+@pytest.mark.usefixtures("no_aggregation")
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"entropy_coeff": {"move_entropy": 0.1, "grip_entropy": 0.3}}],
+    ids=["one-coefficient", "one-for-each-head"],
+)
+def test_composite_actions(options):
+    actor, critic, cost_critic, batch = make_composite(2)
+    clip_loss = ClipPPOLoss(copy.deepcopy(actor), copy.deepcopy(critic), **options)
+    loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=2, **options)
+    assert loss.tensor_keys.action == ["move", "grip"]
+    data = loss.estimate_advantages(batch).reshape(-1)
+    expected = clip_loss(data)
+    assert expected["clip_fraction"] > 0
+    losses = loss(data)
+    assert (losses.pop("composite_entropy") == expected.pop("composite_entropy")).all()
+    assert_same_outputs(losses, expected)
+
+    loss.lagrange_multiplier.fill_(0.5)
+    mixed = loss(data)
+    data["advantage"] = penalized_advantage(
+        data["advantage"], data["cost_advantage"], torch.tensor([0.5, 0.5])
+    )
+    torch.testing.assert_close(mixed["loss_objective"], clip_loss(data)["loss_objective"])
+    mixed["loss_objective"].backward()
+    assert networks_with_gradient(loss) == {"actor"}
+
+
+def test_batch_of_rows_and_time_equals_the_flat_one():
+    loss = make_loss(2, multiplier_init=0.7)
+    batch = loss.estimate_advantages(make_batch(2))
+    rows, flat = loss(batch), loss(batch.reshape(-1))
+    for key in (*TRAINS, "cost_explained_variance"):
+        torch.testing.assert_close(rows[key], flat[key])
