@@ -6,26 +6,41 @@ the multiplier rule is TorchRL's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
+import tyro
+from tensordict import TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torchrl.checkpoint import Checkpoint
+from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ValueEstimators
+from torchrl.record.loggers import get_logger
+from tqdm import tqdm
 
-from torchrl_safe.envs import PANDA, ArmEnv, CartesianDelta, JointDelta
-from torchrl_safe.objectives import PPOLagrangianLoss
+from experiments.evaluation import evaluate, summarize
+from experiments.report import plot_curves, save_animation, save_picture, table
+from torchrl_safe.envs import PANDA, ActionMode, ArmEnv, CartesianDelta, JointDelta
+from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
 
 ARMS = {"panda": PANDA}
-ACTIONS = {"cartesian": CartesianDelta(), "joint": JointDelta()}
+ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointDelta()}
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Config:
-    """Train PPO and PPO-Lagrangian on a robot arm, side by side, and compare them."""
+    """Train PPO and PPO-Lagrangian on a robot arm and compare them."""
 
     arm: Literal["panda"] = "panda"
     """Robot arm."""
@@ -35,49 +50,62 @@ class Config:
     """What to train; ppo is PPO-Lagrangian with its multiplier fixed at 0."""
     cost_limit: float = 0.5
     """Limit of the expected cost of an episode: control steps in which the arm collides."""
-    frames: int = 300_000
-    """Control steps to train for, for each algorithm."""
-    num_envs: int = 32
+    frames: int = 256_000
+    """Control steps to train for, with each algorithm."""
+    envs: int = 32
     """Simulated worlds, shared among the workers."""
     workers: int = 2
-    """Processes that simulate; 1 simulates in this process."""
+    """Processes that simulate; with 1 this process does."""
     seed: int = 0
-    """Seed of the networks, the environments and the minibatches."""
+    """Seed of networks, environments and minibatches."""
     out: Path = Path("runs/train")
     """Folder for logs, checkpoints, results.json and pictures."""
-    logger: Literal["csv", "tensorboard", "wandb"] = "csv"
-    """Where TorchRL logs the training to."""
-    eval_episodes: int = 200
-    """Episodes of the evaluation, with the deterministic policy."""
-    frames_per_batch: int = 4096
+    logger: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
+    """TorchRL logger; wandb and mlflow are to be installed by you."""
+    eval_episodes: int = 256
+    """Episodes of the final evaluation, with the deterministic policy."""
+    frames_per_batch: int = 2048
     """Control steps between two updates of the policy."""
     epochs: int = 10
     """Passes over each batch."""
-    minibatch_size: int = 256
+    minibatch: int = 256
     """Control steps in a minibatch."""
     learning_rate: float = 5e-4
-    """Adam's learning rate, for all three networks."""
-    multiplier_lr: float = 0.1
+    """Adam's learning rate, of all three networks."""
+    gamma: float = 0.97
+    """Discount of reward and cost."""
+    multiplier_rate: float = 0.1
     """Multiplier added for each unit of violated cost, once a batch."""
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.envs % self.workers:
+            raise ValueError(f"envs must be a multiple of workers, got {self.envs} envs.")
 
 
 def make_env(config: Config, num_envs: int, seed: int | None = None) -> EnvBase:
+    """Makes the environment, with the sums of reward and cost over each episode."""
     env = ArmEnv(ARMS[config.arm], action=ACTIONS[config.action], num_envs=num_envs, seed=seed)
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     return TransformedEnv(env, sums)
 
 
-def make_loss(env: EnvBase) -> PPOLagrangianLoss:
+def make_networks(
+    env: EnvBase,
+) -> tuple[ProbabilisticActor, ValueOperator, ValueOperator]:
+    """Makes the policy, the critic of the reward and the critic of the costs."""
     width, actions = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
-    num_costs = env.full_reward_spec["cost"].shape[-1]
 
-    def mlp(outputs: int) -> MLP:
+    def network(outputs: int) -> MLP:
         net = MLP(width, outputs, num_cells=[64, 64], activation_class=torch.nn.Tanh)
+        # Nearly the same action and value everywhere to start with.
         torch.nn.init.orthogonal_(net[-1].weight, 0.01)
         torch.nn.init.zeros_(net[-1].bias)
         return net
 
-    policy = torch.nn.Sequential(mlp(actions), AddStateIndependentNormalScale(actions))
+    policy = torch.nn.Sequential(network(actions), AddStateIndependentNormalScale(actions))
     actor = ProbabilisticActor(
         TensorDictModule(policy, ["observation"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -85,15 +113,141 @@ def make_loss(env: EnvBase) -> PPOLagrangianLoss:
         distribution_kwargs={"tanh_loc": False},
         return_log_prob=True,
     )
-    critic = ValueOperator(mlp(1), in_keys=["observation"])
-    cost_critic = ValueOperator(mlp(num_costs), in_keys=["observation"], out_keys=["cost_value"])
+    critic = ValueOperator(network(1), in_keys=["observation"])
+    num_costs = env.full_reward_spec["cost"].shape[-1]
+    cost_critic = ValueOperator(
+        network(num_costs), in_keys=["observation"], out_keys=["cost_value"]
+    )
+    return actor, critic, cost_critic
+
+
+@contextmanager
+def collecting(config: Config, policy: TensorDictModule) -> Iterator[BaseCollector]:
+    """Opens TorchRL's collector, in this process or in workers, and shuts it down."""
+    settings: dict[str, Any] = {
+        "frames_per_batch": config.frames_per_batch,
+        "total_frames": config.frames,
+        "auto_register_policy_transforms": False,
+    }
+    if config.workers == 1:
+        collector = Collector(make_env(config, config.envs), policy, **settings)
+    else:
+        factory = partial(make_env, config, config.envs // config.workers)
+        collector = MultiSyncCollector([factory] * config.workers, policy, **settings)
+    collector.set_seed(config.seed)
+    try:
+        yield collector
+    finally:
+        collector.shutdown()
+
+
+def train(config: Config, algorithm: str) -> tuple[ProbabilisticActor, list[dict[str, float]]]:
+    """Trains with one algorithm; returns the policy and a row of figures for each batch."""
+    torch.manual_seed(config.seed)
+    example = make_env(config, num_envs=1)
+    actor, critic, cost_critic = make_networks(example)
+    names = example.cost_names
+    example.close()
     loss = PPOLagrangianLoss(
         actor,
         critic,
         cost_critic,
-        num_costs=num_costs,
+        num_costs=len(names),
         entropy_bonus=False,
         loss_critic_type="l2",
     )
-    loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95, vectorized=True)
-    return loss
+    discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
+    loss.make_value_estimator(ValueEstimators.GAE, **discount)
+    loss.make_cost_value_estimator(**discount)
+    updater = DualAscent(loss, cost_limit=config.cost_limit, lr=config.multiplier_rate)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(config.frames_per_batch),
+        sampler=SamplerWithoutReplacement(),
+        batch_size=config.minibatch,
+    )
+    logger = get_logger(config.logger, str(config.out / "logs"), algorithm)
+    history: list[dict[str, float]] = []
+    with (
+        collecting(config, actor) as collector,
+        tqdm(total=config.frames, desc=algorithm, unit="frame", unit_scale=True) as bar,
+    ):
+        for batch in collector:
+            ended = batch["next", "done"].squeeze(-1)
+            if algorithm == "ppo-lagrangian":
+                updater.step(batch["next", "episode_cost"][ended])
+            loss.estimate_advantages(batch)
+            buffer.empty()
+            buffer.extend(batch.reshape(-1))
+            for _ in range(config.epochs):
+                for minibatch in buffer:
+                    losses = loss(minibatch)
+                    sum(v for k, v in losses.items() if k.startswith("loss_")).backward()
+                    torch.nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
+                    optimizer.step()
+                    optimizer.zero_grad()
+            collector.update_policy_weights_()
+            bar.update(batch.numel())
+            row = {"frames": float(bar.n), **figures(batch["next"][ended], names)}
+            row |= multipliers(loss.lagrange_multiplier, names)
+            history.append(row)
+            logger.log_metrics(row, step=bar.n)
+            bar.set_postfix(
+                {k.removeprefix("episode_"): f"{v:.2f}" for k, v in row.items() if k != "frames"}
+            )
+    checkpoint = Checkpoint(loss=loss, optimizer=optimizer, updater=updater)
+    checkpoint.save(config.out / algorithm / "checkpoint")
+    return actor, history
+
+
+def figures(episodes: TensorDictBase, names: tuple[str, ...]) -> dict[str, float]:
+    """Means over the episodes that ended in a batch; none if no episode did."""
+    if not len(episodes):
+        return {}
+    costs = episodes["episode_cost"].mean(0).tolist()
+    return {
+        "return": episodes["episode_reward"].mean().item(),
+        "success": episodes["success"].float().mean().item(),
+        **{f"cost/{name}": cost for name, cost in zip(names, costs, strict=True)},
+    }
+
+
+def multipliers(values: torch.Tensor, names: tuple[str, ...]) -> dict[str, float]:
+    """The multiplier of each cost, by name."""
+    return {f"multiplier/{n}": v for n, v in zip(names, values.tolist(), strict=True)}
+
+
+def main(config: Config) -> None:
+    """Trains and evaluates each algorithm, then writes the comparison."""
+    # The networks are small: more threads than one only wait for each other.
+    torch.set_num_threads(1)
+    config.out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Any] = {
+        "config": json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    }
+    results["versions"] = {name: version(name) for name in ("torch", "torchrl", "pybullet")}
+    results["algorithms"] = {}
+    # Seeds that training does not use.
+    env = make_env(config, num_envs=32, seed=config.seed + 1_000_000)
+    stage = make_env(config, num_envs=1, seed=config.seed + 2_000_000)
+    save_picture(stage, config.out / "scene.png")
+    for algorithm in config.algorithms:
+        start = time.perf_counter()
+        actor, history = train(config, algorithm)
+        results["algorithms"][algorithm] = {
+            "seconds": time.perf_counter() - start,
+            "history": history,
+            "evaluation": summarize(evaluate(env, actor, config.eval_episodes), env.cost_names),
+        }
+        save_animation(stage, actor, config.out / algorithm / "policy.gif")
+        (config.out / "results.json").write_text(json.dumps(results, indent=1, default=str))
+    env.close()
+    stage.close()
+    plot_curves(results, config.out / "curves.png")
+    text = table(results)
+    (config.out / "table.md").write_text(text)
+    print(f"\n{text}\nResults are in {config.out}.")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

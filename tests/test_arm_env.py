@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
+from torchrl.record import PixelRenderTransform
 
 from torchrl_safe.envs import (
     ArmEnv,
@@ -306,3 +308,12 @@ def test_render(make_env):
     red = (pixels[..., 0] > 120) & (pixels[..., 1] < 60) & (pixels[..., 2] < 60)
     assert red.flatten(1).sum(1).min() > 20, "the obstacle is in the picture"
     assert not torch.equal(pixels[0], pixels[1]), "each world has its own goal"
+
+
+def test_pixels_in_a_rollout(make_env):
+    """TorchRL's transform makes an observation of what render() draws."""
+    transform = PixelRenderTransform(width=32, height=24)
+    env = make_env(lambda: TransformedEnv(ArmEnv(num_envs=2, seed=0), transform))
+    pixels = env.rollout(2)["next", "pixels"]
+    assert pixels.shape == (2, 2, 24, 32, 3)
+    assert pixels.float().std() > 10

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from states import make_state
 from torchrl_safe.envs import Collision
 
 
@@ -15,11 +16,11 @@ from torchrl_safe.envs import Collision
     ],
     ids=["overlap", "boundary", "margin", "second-obstacle", "never-more-than-one"],
 )
-def test_collision(make_state, cost, distances, expected):
+def test_collision(cost, distances, expected):
     np.testing.assert_array_equal(cost(make_state(contact_distance=distances)), expected)
 
 
-def test_collision_without_obstacles_is_free(make_state):
+def test_collision_without_obstacles_is_free():
     np.testing.assert_array_equal(
         Collision()(make_state(contact_distance=np.zeros((2, 0)))), [0, 0]
     )

@@ -112,7 +112,7 @@ def test_a_multiplier_set_by_hand_is_where_the_next_step_starts(optimizer):
     loss.lagrange_multiplier = torch.tensor([7.0])
     updater.step(torch.tensor([[1.0]]))
     torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([7.5]))
-    loss.lagrange_multiplier.fill_(3.0)
+    loss.lagrange_multiplier = 3.0
     updater.step(torch.tensor([[1.0]]))
     torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([3.5]))
 

@@ -25,6 +25,11 @@ def test_sampling_leaves_the_goal_alone():
     np.testing.assert_array_equal(goal, [0.7, 0.1, 0.05])
 
 
+def test_in_front_needs_room():
+    with pytest.raises(ValueError, match="gap must be less than the horizontal distance .* 0.200"):
+        InFront(gap=0.2).sample(RNG, np.array([0.3, 0, 0.5]), np.array([0.5, 0, 0.1]))
+
+
 def test_no_obstacles():
     assert NoObstacles().shapes == ()
     assert NoObstacles().sample(RNG, np.zeros(3), np.ones(3)).shape == (0, 3)

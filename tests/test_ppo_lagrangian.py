@@ -225,6 +225,18 @@ def test_estimating_changes_nothing_else_in_the_batch():
     assert batch.names == [None, "time"]
 
 
+def test_estimating_again_follows_the_critics():
+    loss, batch = make_loss(2), make_batch(2)
+    before = loss.estimate_advantages(batch).clone()
+    again = loss.estimate_advantages(batch).clone()
+    loss.cost_critic_network_params.apply_(lambda p: p.data.mul_(2.0))
+    after = loss.estimate_advantages(batch)
+    for key in ("cost_advantage", "cost_value_target"):
+        assert torch.equal(again[key], before[key])
+        assert ((after[key] - before[key]).abs() > 1e-3).any()
+    assert torch.equal(after["advantage"], before["advantage"])
+
+
 @pytest.mark.parametrize("parameter", ["gamma", "lmbda"])
 @pytest.mark.parametrize("moved", ["advantage", "cost_advantage"])
 def test_discount_and_trace_decay_act_on_their_own_advantage_only(moved, parameter):
@@ -385,6 +397,16 @@ def test_only_the_policy_trains_a_shared_trunk_with_separate_losses(name, separa
     assert reached == (TRAINS[name] == "actor" or not separate)
 
 
+@pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
+@pytest.mark.parametrize("name", ["loss_critic", "loss_cost_critic"])
+def test_critics_train_no_encoder_outside_the_loss_with_separate_losses(name, separate):
+    loss = make_loss(2, separate_losses=separate)
+    data = estimated(loss, 2)
+    encoded = data["observation"] = data["observation"].requires_grad_()
+    loss(data)[name].backward()
+    assert (encoded.grad is None) == separate
+
+
 def test_separate_losses_change_no_value():
     joint, _ = make_shared()
     separate, _ = make_shared(separate_losses=True)
@@ -405,6 +427,14 @@ def test_the_multiplier_is_a_buffer_and_no_parameter():
     optimizer.step()
     assert loss.lagrange_multiplier.tolist() == [1.5, 1.5]
     assert loss.lagrange_multiplier.grad is None
+
+
+def test_a_number_can_be_assigned_to_the_multiplier():
+    loss = make_loss(2)
+    address = loss.lagrange_multiplier.data_ptr()
+    loss.lagrange_multiplier = 0.5
+    assert loss.lagrange_multiplier.tolist() == [0.5, 0.5]
+    assert loss.lagrange_multiplier.data_ptr() == address
 
 
 def test_multipliers_are_reported_as_scalars_of_their_own():
@@ -777,6 +807,20 @@ def test_composite_actions(options):
     torch.testing.assert_close(mixed["loss_objective"], clip_loss(data)["loss_objective"])
     mixed["loss_objective"].backward()
     assert networks_with_gradient(loss) == {"actor"}
+
+
+# ---------------------------------------------------------------- the batch
+
+
+@pytest.mark.parametrize("precomputed", [True, False], ids=["advantages-given", "no-advantages"])
+def test_the_loss_writes_nothing_into_its_input(precomputed):
+    loss, batch = make_loss(2, clip_value=0.1), make_batch(2)
+    if precomputed:
+        loss.estimate_advantages(batch)
+    before = batch.clone()
+    loss(batch)
+    assert set(batch.keys(True)) == set(before.keys(True))
+    assert (batch == before).all()
 
 
 def test_batch_of_rows_and_time_equals_the_flat_one():

@@ -1,16 +1,17 @@
 import numpy as np
 import pytest
 
+from states import make_state
 from torchrl_safe.envs import Reach
 
 
-def test_reach_is_euclidean(make_state):
+def test_reach_is_euclidean():
     state = make_state(ee_position=[[0, 0, 0], [0.3, 0, 0.4]], goal=[[3, 0, 4], [0.3, 0.01, 0.4]])
     np.testing.assert_allclose(Reach().reward(state), [-5, -0.01])
     np.testing.assert_array_equal(Reach(radius=0.011).success(state), [False, True])
 
 
-def test_reach_of_the_paper_is_l1(make_state):
+def test_reach_of_the_paper_is_l1():
     state = make_state(ee_position=np.zeros((2, 3)), goal=[[0.03, 0.03, 0.029], [0.04, 0.03, 0.03]])
     np.testing.assert_allclose(Reach(order=1).reward(state), [-0.089, -0.1])
     np.testing.assert_array_equal(Reach(order=1, radius=0.09).success(state), [True, False])

@@ -53,8 +53,8 @@ class ArmEnv(EnvBase):
             concatenated. Defaults to :func:`~torchrl_safe.envs.full_observation`.
         frame_skip (int, optional): physics substeps of 1/240 s for each action. Defaults to
             ``12``: a control rate of 20 Hz.
-        max_episode_steps (int, optional): time limit; sets ``truncated``. Defaults to ``60``,
-            3 s at 20 Hz.
+        max_episode_steps (int, optional): time limit; sets ``truncated``. Defaults to ``40``,
+            2 s at 20 Hz.
         scene (Scene, optional): how the world is simulated. Defaults to ``Scene()``.
         seed (int, optional): seed of the goals and obstacles. Every row has a generator of its
             own; the seeds follow TorchRL's chain, so that two environments of one world in a
@@ -91,7 +91,7 @@ class ArmEnv(EnvBase):
         costs: Mapping[str, Cost] | None = None,
         observation: Callable[[ArmState], dict[str, Array]] = full_observation,
         frame_skip: int = 12,
-        max_episode_steps: int = 60,
+        max_episode_steps: int = 40,
         scene: Scene = Scene(),
         seed: int | None = None,
         device: torch.device | str | None = None,

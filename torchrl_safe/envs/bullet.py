@@ -56,9 +56,9 @@ class Scene:
 class Camera:
     """Where :meth:`~torchrl_safe.envs.ArmEnv.render` looks from; lengths in metres."""
 
-    eye: tuple[float, float, float] = (1.35, -0.95, 0.8)
-    target: tuple[float, float, float] = (0.4, 0.0, 0.2)
-    field_of_view: float = 40.0
+    eye: tuple[float, float, float] = (1.0, -1.25, 0.7)
+    target: tuple[float, float, float] = (0.3, 0.0, 0.3)
+    field_of_view: float = 45.0
 
 
 class World:

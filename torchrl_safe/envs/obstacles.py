@@ -71,7 +71,8 @@ class InFront:
         height: height of the obstacle's centre, m. ``None`` stands it on the table.
 
     Raises:
-        ValueError: if ``gap`` is not positive or ``direction`` is not horizontal.
+        ValueError: if ``gap`` is not positive or ``direction`` is not horizontal; when a goal
+            is drawn that leaves no room for the obstacle before it.
 
     Examples:
         >>> InFront(gap=0.2).shapes
@@ -94,9 +95,15 @@ class InFront:
         return (self.shape,)
 
     def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Array:
-        way = np.array(self.direction if self.direction is not None else goal - start, float)
+        way = np.array(goal - start if self.direction is None else self.direction)
         way[2] = 0
-        centre = goal - self.gap * way / np.linalg.norm(way)
+        length = np.linalg.norm(way)
+        if self.direction is None and length <= self.gap:
+            raise ValueError(
+                f"gap must be less than the horizontal distance from the tool at home to the "
+                f"goal, got a gap of {self.gap} and a distance of {length:.3f}."
+            )
+        centre = goal - self.gap * way / length
         centre[2] = self.shape.height / 2 if self.height is None else self.height
         return centre[None]
 

@@ -109,7 +109,7 @@ class PPOLagrangianLoss(ClipPPOLoss):
         cost_value_target: NestedKey = "cost_value_target"
 
     default_keys = _AcceptedKeys
-    _schedulable_buffers = frozenset({"cost_critic_coeff"})
+    _schedulable_buffers = frozenset({"cost_critic_coeff", "lagrange_multiplier"})
 
     cost_critic_network: TensorDictModule
     cost_critic_network_params: TensorDictParams

@@ -1,0 +1,37 @@
+# `make train` and `make test` are all a new clone needs: the first call makes .venv and installs,
+# later calls install nothing until pyproject.toml or constraints.txt change.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: train test test-slow lint format type clean
+
+train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
+	$(BIN)/python -m experiments.train $(ARGS)
+
+test: $(READY)  ## everything but the slow tests
+	$(BIN)/pytest -m "not slow" $(ARGS)
+
+test-slow: $(READY)  ## the tests that train for minutes
+	$(BIN)/pytest -m slow $(ARGS)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/codespell torchrl_safe experiments tests tutorials *.md
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+type: $(READY)
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) runs
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	touch $@

@@ -1,0 +1,93 @@
+"""Tables and pictures of a training run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import torch
+from PIL import Image
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+COLOURS = ("tab:orange", "tab:blue", "tab:green", "tab:purple")
+
+
+def table(results: dict[str, Any]) -> str:
+    """Returns a Markdown table: a row for each algorithm, estimates with 95 % intervals."""
+    rows = {name: run["evaluation"] for name, run in results["algorithms"].items()}
+    columns = list(next(iter(rows.values())))
+    lines = [
+        "| evaluation | " + " | ".join(_heading(column) for column in columns) + " |",
+        "|---" * (len(columns) + 1) + "|",
+    ]
+    for name, row in rows.items():
+        cells = (_cell(*row[column], share=_is_share(column)) for column in columns)
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    lines.append(f"\nCost limit {results['config']['cost_limit']:g}; brackets: 95 % confidence.")
+    return "\n".join(lines)
+
+
+def plot_curves(results: dict[str, Any], path: Path) -> None:
+    """Draws return and cost against frames, and the cost limit: the paper's Figure 2."""
+    runs = results["algorithms"]
+    history = next(iter(runs.values()))["history"]
+    costs = [key for key in max(history, key=len) if key.startswith("cost/")]
+    figure, axes = plt.subplots(1, 1 + len(costs), figsize=(5 * (1 + len(costs)), 3.6))
+    for axis, key in zip(axes, ["return", *costs], strict=True):
+        for (name, run), colour in zip(runs.items(), COLOURS, strict=False):
+            rows = [row for row in run["history"] if key in row]
+            axis.plot([r["frames"] for r in rows], [r[key] for r in rows], color=colour, label=name)
+        axis.set(xlabel="frames", ylabel=f"episode {key.replace('/', ': ')}")
+        axis.grid(alpha=0.3)
+    for axis in axes[1:]:
+        axis.axhline(results["config"]["cost_limit"], color="black", ls="--", label="limit")
+    axes[-1].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def save_picture(env: EnvBase, path: Path) -> None:
+    """Saves a picture of the first world at the start of an episode."""
+    env.reset()
+    Image.fromarray(env.render(width=640, height=480)[0].numpy()).save(path)
+
+
+@torch.no_grad()
+def save_animation(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    path: Path,
+    episodes: int = 4,
+) -> None:
+    """Saves a GIF of the deterministic policy, at half speed."""
+    frames: list[Image.Image] = []
+
+    def film(env: EnvBase, tensordict: TensorDictBase) -> None:
+        frames.append(Image.fromarray(env.render(width=320, height=240)[0].numpy()))
+
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(episodes):
+            env.rollout(env.max_episode_steps, policy, callback=film)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    milliseconds = round(2000 / env.control_rate)
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
+
+
+def _is_share(column: str) -> bool:
+    return column == "success" or column.startswith("any/")
+
+
+def _heading(column: str) -> str:
+    kind, _, name = column.partition("/")
+    return {"cost": f"episode cost: {name}", "any": f"episodes with {name}"}.get(kind, kind)
+
+
+def _cell(estimate: float, low: float, high: float, *, share: bool) -> str:
+    if share:
+        return f"{estimate:.1%} [{low:.1%}, {high:.1%}]"
+    return f"{estimate:.2f} [{low:.2f}, {high:.2f}]"

@@ -1,0 +1,63 @@
+"""What may import what: losses without environments, environments without losses."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchrl_safe
+
+PACKAGE = Path(torchrl_safe.__file__).parent
+
+
+def test_the_losses_need_no_simulator():
+    code = (
+        "import sys, torchrl_safe.objectives\n"
+        "print(*(n for n in sys.modules if n.split('.')[0] == 'pybullet'\n"
+        "        or n.startswith(('pybullet', 'torchrl_safe.'))))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
+    loaded = set(done.stdout.split())
+    assert "torchrl_safe.objectives.ppo_lagrangian" in loaded
+    assert {name for name in loaded if not name.startswith("torchrl_safe.objectives")} == set()
+
+
+def imported_modules(path):
+    """Names of all modules that a source file imports, at any depth of the file."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"relative import in {path}"
+            # "from torchrl_safe import envs" names a module in the second part.
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def is_in(name, package):
+    return name == package or name.startswith(f"{package}.")
+
+
+@pytest.mark.parametrize(
+    ("importer", "forbidden"),
+    [
+        pytest.param("envs", "torchrl_safe.objectives", id="envs-import-no-losses"),
+        pytest.param("objectives", "torchrl_safe.envs", id="losses-import-no-envs"),
+        pytest.param("objectives", "pybullet", id="losses-import-no-pybullet"),
+    ],
+)
+def test_environments_and_losses_are_apart(importer, forbidden):
+    sources = sorted((PACKAGE / importer).rglob("*.py"))
+    assert sources
+    found = {path.name: list(imported_modules(path)) for path in sources}
+    # The walk sees something: every package imports torch or numpy somewhere.
+    assert any(is_in(name, "torch") for names in found.values() for name in names)
+    assert not {
+        (source, name)
+        for source, names in found.items()
+        for name in names
+        if is_in(name, forbidden)
+    }

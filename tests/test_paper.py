@@ -1,0 +1,155 @@
+"""The paper's environment against what its authors' code was measured to do.
+
+The numbers are from reference runs of the original code (reset pose, spawn heights, step sizes,
+costs and returns of scripted policies), with tolerances for their number of episodes.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, paper_env
+
+
+def step(env, action):
+    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
+
+
+def still(env):
+    """AR1's zero action: no displacement, fingers wherever they are let go."""
+    return torch.zeros(env.action_spec.shape)
+
+
+@pytest.mark.parametrize(
+    ("action", "width"), [(PAPER_CARTESIAN, 4), (PAPER_JOINT, 7)], ids=["AR1", "AR2"]
+)
+def test_shape(make_env, action, width):
+    env = make_env(paper_env, action, num_envs=2)
+    check_env_specs(env)
+    assert env.observation_spec["observation"].shape == (2, 8)
+    assert env.action_spec.shape == (2, width)
+    assert env.control_rate == 240
+    assert env.max_episode_steps == 500
+
+
+def test_start(make_env):
+    env = make_env(paper_env, num_envs=20, seed=0)
+    observation = env.reset()["observation"].numpy()
+    np.testing.assert_allclose(observation[:, :3], [[0.4315, 0, 0.2346]] * 20, atol=1e-4)
+    np.testing.assert_allclose(observation[:, 3:5], 0.08, atol=1e-6)
+    goal = observation[:, 5:]
+    assert ((goal[:, 0] >= 0.6) & (goal[:, 0] <= 0.8)).all()
+    assert (np.abs(goal[:, 1]) <= 0.2).all()
+    np.testing.assert_allclose(goal[:, 2], 0.05, atol=1e-6)
+    np.testing.assert_allclose(
+        env.arm_state.obstacle_position[:, 0], goal + [[-0.2, 0, 0]], atol=1e-6
+    )
+
+
+def test_brick_falls_and_obstacle_is_pushed_out_of_the_table(make_env):
+    env = make_env(paper_env, num_envs=4, seed=0)
+    env.reset()
+    for _ in range(60):
+        step(env, still(env))
+    np.testing.assert_allclose(env.arm_state.goal[:, 2], -0.0135, atol=2e-3)
+    np.testing.assert_allclose(env.arm_state.obstacle_position[:, 0, 2], 0.076, atol=2e-3)
+
+
+def test_a_tenth_of_a_cartesian_command_is_done(make_env):
+    env = make_env(paper_env, seed=0)
+    env.reset()
+    heights = []
+    for _ in range(12):
+        step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0]]))
+        heights.append(env.arm_state.ee_position[0, 2])
+    assert 0.003 < np.diff(heights)[-5:].mean() < 0.005
+
+
+def test_joint_command_turns_a_hundredth(make_env):
+    env = make_env(paper_env, PAPER_JOINT, seed=0)
+    env.reset()
+    angles = []
+    for _ in range(12):
+        step(env, torch.tensor([[1.0, 0, 0, 0, 0, 0, 0]]))
+        angles.append(env.arm_state.joint_position[0, 0])
+    np.testing.assert_allclose(np.diff(angles)[-5:], 0.01, atol=5e-4)
+
+
+def test_actions_are_not_clipped(make_env):
+    env = make_env(paper_env, PAPER_JOINT, seed=0)
+    env.reset()
+    start = env.arm_state.joint_position[0, 0]
+    for _ in range(12):
+        step(env, torch.tensor([[3.0, 0, 0, 0, 0, 0, 0]]))
+    assert env.arm_state.joint_position[0, 0] - start > 0.2
+
+
+def test_tool_pose_lags_one_substep(make_env):
+    env = make_env(paper_env, seed=0)
+    env.reset()
+    step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0]]))
+    fresh = np.array(env._worlds[0].read(fresh=True))[16:19]
+    step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(env.arm_state.ee_position[0], fresh, atol=1e-6)
+
+
+def test_reward_is_the_l1_distance(make_env):
+    env = make_env(paper_env, num_envs=3, seed=0)
+    env.reset()
+    result = step(env, still(env))
+    state = env.arm_state
+    expected = -np.abs(state.ee_position - state.goal).sum(1)
+    np.testing.assert_allclose(result["reward"][:, 0], expected, rtol=1e-5)
+
+
+def fly(env, waypoints, tolerance=0.03):
+    """Flies straight from waypoint to waypoint, at an action of at most 1 in any component."""
+    env.reset()
+    rows = env.num_envs
+    stage, alive = np.zeros(rows, int), np.ones(rows, bool)
+    total, cost, success = np.zeros(rows), np.zeros(rows), np.zeros(rows, bool)
+    for _ in range(env.max_episode_steps):
+        state = env.arm_state
+        points = waypoints(state)[stage, np.arange(rows)]
+        delta = (points - state.ee_position) / 0.05
+        delta /= np.maximum(1, np.abs(delta).max(1, keepdims=True))
+        action = torch.as_tensor(np.c_[delta, np.zeros(rows)], dtype=torch.float32)
+        result = step(env, action)
+        total += np.where(alive, result["reward"][:, 0].numpy(), 0)
+        cost += np.where(alive, result["cost"][:, 0].numpy(), 0)
+        success |= alive & result["success"][:, 0].numpy()
+        alive &= ~result["done"][:, 0].numpy()
+        near = np.linalg.norm(points - env.arm_state.ee_position, axis=1) < tolerance
+        stage = np.minimum(stage + near, len(waypoints(state)) - 1)
+        if not alive.any():
+            break
+    return success.mean(), total.mean(), cost.mean()
+
+
+def test_straight_policy_scores_as_in_the_original(make_env):
+    """Measured there, 50 episodes: success 1.00, return -21.6 +- 6.6, cost 28.6 +- 15.1."""
+    env = make_env(paper_env, num_envs=20, seed=1)
+    success, total, cost = fly(env, lambda state: state.goal[None])
+    assert success == 1
+    standard_error = math.sqrt(1 / 20 + 1 / 50)
+    assert total == pytest.approx(-21.6, abs=3 * 6.6 * standard_error)
+    assert cost == pytest.approx(28.6, abs=3 * 15.1 * standard_error)
+
+
+def test_going_around_costs_nothing(make_env):
+    """Measured there: 22 cm sideways, then in, reaches every target at cost 0."""
+    env = make_env(paper_env, num_envs=20, seed=2)
+
+    def around(state):
+        inwards = np.where(state.goal[:, 1:2] > 0, -1, 1) * [[0, 0.22, 0]]
+        beside_the_obstacle = state.goal + inwards + [[-0.2, 0, 0.1]]
+        beside_the_goal = state.goal + inwards + [[0, 0, 0.05]]
+        return np.stack([beside_the_obstacle, beside_the_goal, state.goal])
+
+    success, _, cost = fly(env, around)
+    assert success == 1
+    assert cost == 0

@@ -1,0 +1,118 @@
+"""The main job, made small: what it leaves behind, and what it refuses."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from experiments.evaluation import mean, share
+from experiments.report import table
+from experiments.train import Config, make_env, make_networks
+from PIL import Image
+from torchrl.checkpoint import Checkpoint
+
+from torchrl_safe.objectives import PPOLagrangianLoss
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.train", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    done = run(
+        "--frames", 2048, "--frames-per-batch", 1024, "--envs", 8, "--workers", 1,
+        "--eval-episodes", 32, "--out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    return out, done.stdout
+
+
+def test_what_it_leaves(finished):
+    out, stdout = finished
+    results = json.loads((out / "results.json").read_text())
+    assert list(results["algorithms"]) == ["ppo", "ppo-lagrangian"]
+    for name, run in results["algorithms"].items():
+        assert [row["frames"] for row in run["history"]] == [1024, 2048]
+        for estimate, low, high in run["evaluation"].values():
+            assert low <= estimate <= high
+        with Image.open(out / name / "policy.gif") as film:
+            assert film.n_frames > 10
+        assert list((out / "logs").rglob(f"*{name}*"))
+    for picture in ("curves.png", "scene.png"):
+        with Image.open(out / picture) as image:
+            assert image.width >= 640
+    assert table(results) in stdout
+    assert (out / "table.md").read_text() == table(results)
+
+
+def test_ppo_has_no_multiplier_and_its_brother_has(finished):
+    out, _ = finished
+    runs = json.loads((out / "results.json").read_text())["algorithms"]
+    multipliers = {
+        name: [row["multiplier/collision"] for row in run["history"]] for name, run in runs.items()
+    }
+    assert multipliers["ppo"] == [0, 0]
+    assert multipliers["ppo-lagrangian"][-1] > 0
+
+
+def test_checkpoint_holds_the_loss(finished):
+    out, _ = finished
+    results = json.loads((out / "results.json").read_text())
+    env = make_env(Config(), num_envs=1)
+    loss = PPOLagrangianLoss(*make_networks(env), entropy_bonus=False)
+    env.close()
+    before = {key: value.clone() for key, value in loss.state_dict().items()}
+    Checkpoint(loss=loss).load(out / "ppo-lagrangian" / "checkpoint")
+    last = results["algorithms"]["ppo-lagrangian"]["history"][-1]
+    assert loss.lagrange_multiplier.item() == pytest.approx(last["multiplier/collision"])
+    assert not torch.equal(
+        before["actor_network_params.module.0.module.0.0.weight"],
+        loss.state_dict()["actor_network_params.module.0.module.0.0.weight"],
+    )
+
+
+def test_help_names_the_options():
+    done = run("--help")
+    assert done.returncode == 0
+    for option in (
+        "arm", "action", "algorithms", "cost-limit", "frames", "envs", "workers", "seed", "out",
+        "logger",
+    ):  # fmt: skip
+        assert f"--{option}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"frames": 0}, "frames must be at least 1, got 0"),
+        ({"workers": 0}, "workers must be at least 1, got 0"),
+        ({"envs": 5, "workers": 2}, "envs must be a multiple of workers, got 5"),
+    ],
+)
+def test_bad_settings(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Config(**settings)
+
+
+def test_intervals():
+    assert share(torch.tensor([True] * 9 + [False]))[0] == 0.9
+    # Wilson's interval of 9 successes in 10, from its closed form with z = 1.96.
+    assert share(torch.tensor([True] * 9 + [False]))[1:] == pytest.approx([0.596, 0.982], abs=1e-3)
+    estimate, low, high = mean(torch.tensor([0.0, 1.0] * 200))
+    assert estimate == 0.5
+    # The standard error is 0.5 / sqrt(400) = 0.025.
+    assert [low, high] == pytest.approx([0.451, 0.549], abs=6e-3)
+    assert mean(torch.zeros(50)) == [0, 0, 0]
