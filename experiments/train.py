@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,11 +32,12 @@ from tqdm import tqdm
 
 from experiments.evaluation import evaluate, summarize
 from experiments.report import plot_curves, save_animation, save_picture, table
-from torchrl_safe.envs import PANDA, ActionMode, ArmEnv, CartesianDelta, JointDelta
+from torchrl_safe.envs import PANDA, ActionMode, ArmEnv, CartesianDelta, Collision, JointDelta
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
 
 ARMS = {"panda": PANDA}
 ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointDelta()}
+COSTS = {"collision": Collision()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,32 +73,47 @@ class Config:
     minibatch: int = 256
     """Control steps in a minibatch."""
     learning_rate: float = 5e-4
-    """Adam's learning rate, of all three networks."""
+    """Adam's learning rate at the start, of all three networks; it falls linearly to 0."""
     gamma: float = 0.97
     """Discount of reward and cost."""
-    multiplier_rate: float = 0.1
+    multiplier_rate: float = 0.2
     """Multiplier added for each unit of violated cost, once a batch."""
+    margin: float = 0.2
+    """Share of the cost limit held back in training. A limit that binds is met on average only:
+    a policy trained for exactly the limit is found above it in every other evaluation."""
 
     def __post_init__(self) -> None:
         for name in ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        if self.envs % self.workers:
-            raise ValueError(f"envs must be a multiple of workers, got {self.envs} envs.")
+        if not 0 <= self.margin < 1:
+            raise ValueError(f"margin must be at least 0 and less than 1, got {self.margin}.")
+        for name, divisor in (("envs", "workers"), ("frames_per_batch", "envs")):
+            if getattr(self, name) % getattr(self, divisor):
+                raise ValueError(
+                    f"{name} must be a multiple of {divisor}, got {getattr(self, name)} and "
+                    f"{getattr(self, divisor)}."
+                )
 
 
 def make_env(config: Config, num_envs: int, seed: int | None = None) -> EnvBase:
     """Makes the environment, with the sums of reward and cost over each episode."""
-    env = ArmEnv(ARMS[config.arm], action=ACTIONS[config.action], num_envs=num_envs, seed=seed)
+    env = ArmEnv(
+        ARMS[config.arm],
+        action=ACTIONS[config.action],
+        costs=COSTS,
+        num_envs=num_envs,
+        seed=seed,
+    )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     return TransformedEnv(env, sums)
 
 
-def make_networks(
-    env: EnvBase,
-) -> tuple[ProbabilisticActor, ValueOperator, ValueOperator]:
-    """Makes the policy, the critic of the reward and the critic of the costs."""
+def make_agent(config: Config) -> tuple[ProbabilisticActor, PPOLagrangianLoss]:
+    """Makes the policy, and the loss with the policy, both critics and the multipliers."""
+    env = make_env(config, num_envs=1)
     width, actions = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+    env.close()
 
     def network(outputs: int) -> MLP:
         net = MLP(width, outputs, num_cells=[64, 64], activation_class=torch.nn.Tanh)
@@ -113,12 +130,18 @@ def make_networks(
         distribution_kwargs={"tanh_loc": False},
         return_log_prob=True,
     )
-    critic = ValueOperator(network(1), in_keys=["observation"])
-    num_costs = env.full_reward_spec["cost"].shape[-1]
-    cost_critic = ValueOperator(
-        network(num_costs), in_keys=["observation"], out_keys=["cost_value"]
+    loss = PPOLagrangianLoss(
+        actor,
+        ValueOperator(network(1), in_keys=["observation"]),
+        ValueOperator(network(len(COSTS)), in_keys=["observation"], out_keys=["cost_value"]),
+        num_costs=len(COSTS),
+        entropy_bonus=False,
+        loss_critic_type="l2",
     )
-    return actor, critic, cost_critic
+    discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
+    loss.make_value_estimator(ValueEstimators.GAE, **discount)
+    loss.make_cost_value_estimator(**discount)
+    return actor, loss
 
 
 @contextmanager
@@ -144,41 +167,28 @@ def collecting(config: Config, policy: TensorDictModule) -> Iterator[BaseCollect
 def train(config: Config, algorithm: str) -> tuple[ProbabilisticActor, list[dict[str, float]]]:
     """Trains with one algorithm; returns the policy and a row of figures for each batch."""
     torch.manual_seed(config.seed)
-    example = make_env(config, num_envs=1)
-    actor, critic, cost_critic = make_networks(example)
-    names = example.cost_names
-    example.close()
-    loss = PPOLagrangianLoss(
-        actor,
-        critic,
-        cost_critic,
-        num_costs=len(names),
-        entropy_bonus=False,
-        loss_critic_type="l2",
-    )
-    discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
-    loss.make_value_estimator(ValueEstimators.GAE, **discount)
-    loss.make_cost_value_estimator(**discount)
-    updater = DualAscent(loss, cost_limit=config.cost_limit, lr=config.multiplier_rate)
+    actor, loss = make_agent(config)
+    target = (1 - config.margin) * config.cost_limit
+    updater = DualAscent(loss, cost_limit=target, lr=config.multiplier_rate)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate)
+    batches = math.ceil(config.frames / config.frames_per_batch)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=batches)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(config.frames_per_batch),
         sampler=SamplerWithoutReplacement(),
         batch_size=config.minibatch,
     )
     logger = get_logger(config.logger, str(config.out / "logs"), algorithm)
-    history: list[dict[str, float]] = []
+    history = []
     with (
         collecting(config, actor) as collector,
         tqdm(total=config.frames, desc=algorithm, unit="frame", unit_scale=True) as bar,
     ):
         for batch in collector:
-            ended = batch["next", "done"].squeeze(-1)
+            episodes = batch["next"][batch["next", "done"].squeeze(-1)]
             if algorithm == "ppo-lagrangian":
-                updater.step(batch["next", "episode_cost"][ended])
-            loss.estimate_advantages(batch)
-            buffer.empty()
-            buffer.extend(batch.reshape(-1))
+                updater.step(episodes["episode_cost"])
+            buffer.extend(loss.estimate_advantages(batch).reshape(-1))
             for _ in range(config.epochs):
                 for minibatch in buffer:
                     losses = loss(minibatch)
@@ -186,35 +196,32 @@ def train(config: Config, algorithm: str) -> tuple[ProbabilisticActor, list[dict
                     torch.nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
                     optimizer.step()
                     optimizer.zero_grad()
+            schedule.step()
             collector.update_policy_weights_()
             bar.update(batch.numel())
-            row = {"frames": float(bar.n), **figures(batch["next"][ended], names)}
-            row |= multipliers(loss.lagrange_multiplier, names)
-            history.append(row)
+            row = figures(episodes, loss.lagrange_multiplier)
+            bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
             logger.log_metrics(row, step=bar.n)
-            bar.set_postfix(
-                {k.removeprefix("episode_"): f"{v:.2f}" for k, v in row.items() if k != "frames"}
-            )
-    checkpoint = Checkpoint(loss=loss, optimizer=optimizer, updater=updater)
+            history.append({"frames": bar.n, **row})
+    checkpoint = Checkpoint(loss=loss, optimizer=optimizer, schedule=schedule, updater=updater)
     checkpoint.save(config.out / algorithm / "checkpoint")
     return actor, history
 
 
-def figures(episodes: TensorDictBase, names: tuple[str, ...]) -> dict[str, float]:
-    """Means over the episodes that ended in a batch; none if no episode did."""
+def figures(episodes: TensorDictBase, multiplier: torch.Tensor) -> dict[str, float]:
+    """Means over the episodes that ended in a batch (none if no episode did), and multipliers."""
+    multipliers = {
+        f"multiplier/{name}": value for name, value in zip(COSTS, multiplier.tolist(), strict=True)
+    }
     if not len(episodes):
-        return {}
+        return multipliers
     costs = episodes["episode_cost"].mean(0).tolist()
     return {
         "return": episodes["episode_reward"].mean().item(),
+        **{f"cost/{name}": cost for name, cost in zip(COSTS, costs, strict=True)},
         "success": episodes["success"].float().mean().item(),
-        **{f"cost/{name}": cost for name, cost in zip(names, costs, strict=True)},
+        **multipliers,
     }
-
-
-def multipliers(values: torch.Tensor, names: tuple[str, ...]) -> dict[str, float]:
-    """The multiplier of each cost, by name."""
-    return {f"multiplier/{n}": v for n, v in zip(names, values.tolist(), strict=True)}
 
 
 def main(config: Config) -> None:
@@ -223,10 +230,10 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)
     config.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, Any] = {
-        "config": json.loads(json.dumps(dataclasses.asdict(config), default=str))
+        "config": dataclasses.asdict(config),
+        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
+        "algorithms": {},
     }
-    results["versions"] = {name: version(name) for name in ("torch", "torchrl", "pybullet")}
-    results["algorithms"] = {}
     # Seeds that training does not use.
     env = make_env(config, num_envs=32, seed=config.seed + 1_000_000)
     stage = make_env(config, num_envs=1, seed=config.seed + 2_000_000)
@@ -237,7 +244,7 @@ def main(config: Config) -> None:
         results["algorithms"][algorithm] = {
             "seconds": time.perf_counter() - start,
             "history": history,
-            "evaluation": summarize(evaluate(env, actor, config.eval_episodes), env.cost_names),
+            "evaluation": summarize(evaluate(env, actor, config.eval_episodes), tuple(COSTS)),
         }
         save_animation(stage, actor, config.out / algorithm / "policy.gif")
         (config.out / "results.json").write_text(json.dumps(results, indent=1, default=str))

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from scripted import fly
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -216,6 +217,24 @@ def test_touch_in_the_middle_of_a_control_step_counts(make_env):
         assert cost == float(any(touches)), index
         lost += any(touches) and not touches[-1]
     assert lost > 0
+
+
+def test_the_obstacle_stands_in_the_way_and_can_be_passed(make_env):
+    """Straight at the goal, every episode collides; over the obstacle, all succeed at no cost."""
+    env = make_env(ArmEnv, num_envs=32, seed=0)
+    _, _, cost = fly(env, lambda state: state.goal[None])
+    assert (cost > 0).all()
+
+    home = np.asarray(env._worlds[0].home_position)
+
+    def over(state):
+        up, across = np.tile(home, (32, 1)), state.goal.copy()
+        up[:, 2] = across[:, 2] = 0.33
+        return np.stack([up, across, state.goal])
+
+    success, _, cost = fly(env, over)
+    assert success.all()
+    assert not cost.any()
 
 
 def test_actions_are_clipped(make_env):

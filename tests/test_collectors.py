@@ -24,9 +24,7 @@ def make_env(num_envs, seed=None):
         max_episode_steps=6,
         seed=seed,
     )
-    return TransformedEnv(
-        env, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
-    )
+    return TransformedEnv(env, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
 
 
 def check(batch, shape):
@@ -48,9 +46,7 @@ def check(batch, shape):
 
 def test_collector():
     env = make_env(2, seed=0)
-    collector = Collector(
-        env, RandomPolicy(env.action_spec), frames_per_batch=24, total_frames=48
-    )
+    collector = Collector(env, RandomPolicy(env.action_spec), frames_per_batch=24, total_frames=48)
     batches = list(collector)
     assert len(batches) == 2
     for batch in batches:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-
 from states import make_state
+
 from torchrl_safe.envs import Collision
 
 

@@ -26,7 +26,7 @@ def test_sampling_leaves_the_goal_alone():
 
 
 def test_in_front_needs_room():
-    with pytest.raises(ValueError, match="gap must be less than the horizontal distance .* 0.200"):
+    with pytest.raises(ValueError, match=r"gap must be less than .* a distance of 0\.200"):
         InFront(gap=0.2).sample(RNG, np.array([0.3, 0, 0.5]), np.array([0.5, 0, 0.1]))
 
 

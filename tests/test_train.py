@@ -7,13 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from experiments.evaluation import mean, share
-from experiments.report import table
-from experiments.train import Config, make_env, make_networks
 from PIL import Image
 from torchrl.checkpoint import Checkpoint
 
-from torchrl_safe.objectives import PPOLagrangianLoss
+from experiments.evaluation import mean, share
+from experiments.report import table
+from experiments.train import Config, make_agent
 
 ROOT = Path(__file__).parent.parent
 
@@ -71,9 +70,7 @@ def test_ppo_has_no_multiplier_and_its_brother_has(finished):
 def test_checkpoint_holds_the_loss(finished):
     out, _ = finished
     results = json.loads((out / "results.json").read_text())
-    env = make_env(Config(), num_envs=1)
-    loss = PPOLagrangianLoss(*make_networks(env), entropy_bonus=False)
-    env.close()
+    _, loss = make_agent(Config())
     before = {key: value.clone() for key, value in loss.state_dict().items()}
     Checkpoint(loss=loss).load(out / "ppo-lagrangian" / "checkpoint")
     last = results["algorithms"]["ppo-lagrangian"]["history"][-1]
@@ -99,7 +96,9 @@ def test_help_names_the_options():
     [
         ({"frames": 0}, "frames must be at least 1, got 0"),
         ({"workers": 0}, "workers must be at least 1, got 0"),
-        ({"envs": 5, "workers": 2}, "envs must be a multiple of workers, got 5"),
+        ({"envs": 5, "workers": 2}, "envs must be a multiple of workers, got 5 and 2"),
+        ({"envs": 6, "workers": 2}, "frames_per_batch must be a multiple of envs"),
+        ({"margin": 1.0}, "margin must be at least 0 and less than 1, got 1.0"),
     ],
 )
 def test_bad_settings(settings, message):
