@@ -21,6 +21,7 @@ import torch
 import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
@@ -226,6 +227,8 @@ def figures(episodes: TensorDictBase, multiplier: torch.Tensor) -> dict[str, flo
 
 def main(config: Config) -> None:
     """Trains and evaluates each algorithm, then writes the comparison."""
+    # TorchRL's notes on each buffer would break up the progress bar.
+    torchrl_logger.setLevel("WARNING")
     # The networks are small: more threads than one only wait for each other.
     torch.set_num_threads(1)
     config.out.mkdir(parents=True, exist_ok=True)

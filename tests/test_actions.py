@@ -16,8 +16,9 @@ from torchrl_safe.envs import (
     JointDelta,
     NoObstacles,
 )
-from torchrl_safe.envs.bullet import Scene, World
+from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.kinematics import rotation_vector
+from torchrl_safe.envs.scene import Scene
 
 
 def drive(env, goal, steps):

@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_safe.envs import PANDA, ArmEnv
-from torchrl_safe.envs.bullet import Scene, World
+from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.scene import Scene
 
 
 def open_clients():
@@ -65,6 +66,15 @@ def test_forgotten_world_is_closed():
     world = World(PANDA, Scene(), ())
     assert open_clients() != before
     del world
+    assert open_clients() == before
+
+
+def test_failed_environment_is_closed():
+    before = open_clients()
+    with pytest.raises(ValueError, match="cost 'flat'") as held:
+        ArmEnv(num_envs=3, costs={"flat": lambda state: 0.0})
+    # Closed, not merely forgotten: the exception still holds the environment.
+    assert held.value.__traceback__ is not None
     assert open_clients() == before
 
 

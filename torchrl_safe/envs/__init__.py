@@ -3,7 +3,6 @@
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
 from torchrl_safe.envs.arms import PANDA, ArmModel
-from torchrl_safe.envs.bullet import Camera, Scene
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.kinematics import (
     BulletInverseKinematics,
@@ -13,6 +12,7 @@ from torchrl_safe.envs.kinematics import (
 from torchrl_safe.envs.observations import full_observation, paper_observation
 from torchrl_safe.envs.obstacles import Cylinder, InFront, NoObstacles, Obstacles
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, paper_env
+from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.state import ArmState
 from torchrl_safe.envs.tasks import Reach, Task
 

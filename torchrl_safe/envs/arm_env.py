@@ -15,10 +15,11 @@ from torchrl.envs import EnvBase
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta
 from torchrl_safe.envs.arms import PANDA, ArmModel
-from torchrl_safe.envs.bullet import SUBSTEP, Camera, Scene, World
+from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.observations import full_observation
 from torchrl_safe.envs.obstacles import InFront, Obstacles
+from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.state import ArmState, Array
 from torchrl_safe.envs.tasks import Reach, Task
 
@@ -119,12 +120,18 @@ class ArmEnv(EnvBase):
         self._scene = scene
         self._picture_world: World | None = None
         shapes = obstacles.shapes
-        self._worlds = [World(arm, scene, shapes, gui=gui and i == 0) for i in range(num_envs)]
         self._obstacle_size = np.array([s.half_extents for s in shapes]).reshape(-1, 3)
         self._elapsed = np.zeros(num_envs, dtype=int)
         self._rows: list[tuple[float, ...]] = [()] * num_envs
+        self._worlds: list[World] = []
+        try:
+            for index in range(num_envs):
+                self._worlds.append(World(arm, scene, shapes, gui=gui and index == 0))
+            self._make_specs()
+        except BaseException:
+            self._close_worlds()
+            raise
         self.set_seed(seed)
-        self._make_specs()
 
     @property
     def num_envs(self) -> int:
@@ -256,6 +263,9 @@ class ArmEnv(EnvBase):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         super().close(raise_if_closed=raise_if_closed)
+        self._close_worlds()
+
+    def _close_worlds(self) -> None:
         for world in self._worlds:
             world.close()
         if self._picture_world is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,50 +14,13 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Cylinder
+from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.state import Array
 from torchrl_safe.envs.urdf import prepare_urdf
-
-#: Duration of one physics substep, s (PyBullet's default).
-SUBSTEP = 1 / 240
 
 _RED, _YELLOW, _WOOD = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.72, 0.58, 0.42, 1.0)
 _LIMBO = (0.0, 0.0, -100.0)
 _UNLIMITED_EFFORT = 1e5
-
-
-@dataclass(frozen=True)
-class Scene:
-    """How the world around the arm is simulated. The defaults are the cheapest that are right.
-
-    Args:
-        gravity: m/s^2, downwards.
-        furniture: URDF files of ``pybullet_data`` with their positions. Empty gives a table
-            whose top is at height 0.
-        target_urdf: body of the target, free to move; the goal is then read from the
-            simulator. ``None`` makes the target a mere point.
-        free_fingers: leave the joints that are not part of the arm movable.
-        effort_limits: limit the motors to the efforts of the URDF.
-        urdf_inertia: take inertias from the URDF instead of from the collision shapes.
-        fresh_links: read the tool pose of the current joint angles. ``False`` reads it one
-            physics substep late, as PyBullet does unless told otherwise.
-    """
-
-    gravity: float = 9.81
-    furniture: tuple[tuple[str, tuple[float, float, float]], ...] = ()
-    target_urdf: str | None = None
-    free_fingers: bool = False
-    effort_limits: bool = True
-    urdf_inertia: bool = False
-    fresh_links: bool = True
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Where :meth:`~torchrl_safe.envs.ArmEnv.render` looks from; lengths in metres."""
-
-    eye: tuple[float, float, float] = (1.0, -1.25, 0.7)
-    target: tuple[float, float, float] = (0.3, 0.0, 0.3)
-    field_of_view: float = 45.0
 
 
 class World:

@@ -9,11 +9,11 @@ from typing import Any
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
 from torchrl_safe.envs.arms import PANDA
-from torchrl_safe.envs.bullet import Scene
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.kinematics import BulletInverseKinematics
 from torchrl_safe.envs.observations import paper_observation
 from torchrl_safe.envs.obstacles import Cylinder, InFront
+from torchrl_safe.envs.scene import Scene
 from torchrl_safe.envs.tasks import Reach
 
 #: AR1: displacements of the tool point and the position of the fingers, not clipped.
