@@ -15,7 +15,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 @torch.no_grad()
 def evaluate(
-    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], episodes: int
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    episodes: int,
+    seed: int,
 ) -> TensorDict:
     """Runs the deterministic policy.
 
@@ -26,6 +29,7 @@ def evaluate(
         env: batched environment with ``episode_reward`` and ``episode_cost``.
         policy: the policy.
         episodes: how many episodes at least.
+        seed: seed of the episodes, so that every policy meets the same ones.
 
     Returns:
         One row for each episode, with ``success``, ``episode_reward``, ``episode_cost`` and
@@ -34,6 +38,7 @@ def evaluate(
     rounds = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(math.ceil(episodes / env.num_envs)):
+            seed = env.set_seed(seed)
             play = env.rollout(env.max_episode_steps, policy, break_when_any_done=False)
             last = play["next", "done"].squeeze(-1).int().argmax(1)
             end = play["next"][torch.arange(env.num_envs), last]

@@ -36,7 +36,9 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
     runs = results["algorithms"]
     history = next(iter(runs.values()))["history"]
     costs = [key for key in max(history, key=len) if key.startswith("cost/")]
-    figure, axes = plt.subplots(1, 1 + len(costs), figsize=(5 * (1 + len(costs)), 3.6))
+    size = (5 * (1 + len(costs)), 3.6)
+    figure, grid = plt.subplots(1, 1 + len(costs), figsize=size, squeeze=False)
+    axes = list(grid[0])
     for axis, key in zip(axes, ["return", *costs], strict=True):
         for (name, run), colour in zip(runs.items(), COLOURS, strict=False):
             rows = [row for row in run["history"] if key in row]

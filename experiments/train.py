@@ -79,16 +79,19 @@ class Config:
     """Discount of reward and cost."""
     multiplier_rate: float = 0.2
     """Multiplier added for each unit of violated cost, once a batch."""
-    margin: float = 0.2
-    """Share of the cost limit held back in training. A limit that binds is met on average only:
-    a policy trained for exactly the limit is found above it in every other evaluation."""
 
     def __post_init__(self) -> None:
-        for name in ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs"):
+        counts = ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs")
+        for name in (*counts, "minibatch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        if not 0 <= self.margin < 1:
-            raise ValueError(f"margin must be at least 0 and less than 1, got {self.margin}.")
+        for name in ("learning_rate", "multiplier_rate", "gamma"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        if not 0 <= self.cost_limit < math.inf:
+            raise ValueError(f"cost_limit must not be negative, got {self.cost_limit}.")
+        if not self.algorithms:
+            raise ValueError("algorithms must name at least one algorithm, got none.")
         for name, divisor in (("envs", "workers"), ("frames_per_batch", "envs")):
             if getattr(self, name) % getattr(self, divisor):
                 raise ValueError(
@@ -169,8 +172,7 @@ def train(config: Config, algorithm: str) -> tuple[ProbabilisticActor, list[dict
     """Trains with one algorithm; returns the policy and a row of figures for each batch."""
     torch.manual_seed(config.seed)
     actor, loss = make_agent(config)
-    target = (1 - config.margin) * config.cost_limit
-    updater = DualAscent(loss, cost_limit=target, lr=config.multiplier_rate)
+    updater = DualAscent(loss, cost_limit=config.cost_limit, lr=config.multiplier_rate)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate)
     batches = math.ceil(config.frames / config.frames_per_batch)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=batches)
@@ -237,17 +239,18 @@ def main(config: Config) -> None:
         "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
         "algorithms": {},
     }
-    # Seeds that training does not use.
-    env = make_env(config, num_envs=32, seed=config.seed + 1_000_000)
-    stage = make_env(config, num_envs=1, seed=config.seed + 2_000_000)
+    env, stage = make_env(config, num_envs=32), make_env(config, num_envs=1, seed=config.seed)
     save_picture(stage, config.out / "scene.png")
     for algorithm in config.algorithms:
         start = time.perf_counter()
         actor, history = train(config, algorithm)
+        seconds = time.perf_counter() - start
+        # Seeds that training does not use.
+        episodes = evaluate(env, actor, config.eval_episodes, seed=config.seed + 1_000_000)
         results["algorithms"][algorithm] = {
-            "seconds": time.perf_counter() - start,
+            "seconds": seconds,
             "history": history,
-            "evaluation": summarize(evaluate(env, actor, config.eval_episodes), tuple(COSTS)),
+            "evaluation": summarize(episodes, tuple(COSTS)),
         }
         save_animation(stage, actor, config.out / algorithm / "policy.gif")
         (config.out / "results.json").write_text(json.dumps(results, indent=1, default=str))

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_safe.envs import (
     PANDA,
@@ -15,17 +16,18 @@ from torchrl_safe.envs import (
     DampedLeastSquares,
     JointDelta,
     NoObstacles,
+    Reach,
+    Scene,
 )
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.kinematics import rotation_vector
-from torchrl_safe.envs.scene import Scene
 
 
 def drive(env, goal, steps):
     """Moves the tool towards a point, as a policy that sees the goal would."""
     for _ in range(steps):
         delta = torch.as_tensor(goal - env.arm_state.ee_position) / env.action_mode.step
-        env.step(env.fake_tensordict().select().set("action", delta.float()))
+        env.step(TensorDict({"action": delta.float()}, batch_size=env.batch_size))
     return env.arm_state
 
 
@@ -104,10 +106,40 @@ def test_full_action_keeps_joint_limits(make_env, action):
     env.reset()
     # Long enough for every joint to meet its stop, time limit or not.
     for _ in range(100):
-        env.step(env.fake_tensordict().select().set("action", actions))
+        env.step(TensorDict({"action": actions}, batch_size=env.batch_size))
     state = env.arm_state
     assert (state.joint_position >= state.joint_lower - 0.01).all()
     assert (state.joint_position <= state.joint_upper + 0.01).all()
+
+
+@pytest.mark.parametrize("action", [CartesianDelta(), JointDelta()], ids=lambda a: type(a).__name__)
+def test_joints_keep_to_the_speeds_of_the_urdf(make_env, action):
+    """Within what the efforts allow: full reversals shake the wrist's 12 N m joints beyond it."""
+    task = Reach(low=(0.7, 0, 0.5), high=(0.7, 0, 0.5), radius=0.001)
+    env = make_env(ArmEnv, num_envs=8, action=action, task=task, obstacles=NoObstacles(), seed=0)
+    generator = torch.manual_seed(0)
+    limit = env._worlds[0].joint_speed
+    np.testing.assert_allclose(limit, [2.175] * 4 + [2.61] * 3)
+    fastest = 0
+    for _ in range(5):
+        env.reset()
+        for _ in range(8):
+            actions = torch.randn(env.action_spec.shape, generator=generator).sign()
+            env.step(TensorDict({"action": actions}, batch_size=[8]))
+            fastest = max(fastest, (np.abs(env.arm_state.joint_velocity) / limit).max())
+    assert 0.5 < fastest < 1.3
+
+
+def test_fingers_follow_with_motor_limits(make_env):
+    action = CartesianDelta(finger_step=0.02)
+    env = make_env(
+        ArmEnv, action=action, scene=Scene(free_fingers=True), obstacles=NoObstacles(), seed=0
+    )
+    assert env.action_spec.shape == (1, 4)
+    env.reset()
+    for _ in range(20):
+        env.step(TensorDict({"action": torch.tensor([[0, 0, 0, 1.0]])}, batch_size=[1]))
+    np.testing.assert_allclose(env.arm_state.finger_position, [[0.02, 0.02]], atol=1e-3)
 
 
 def test_joint_delta_turns_the_joints(make_env):
@@ -115,7 +147,7 @@ def test_joint_delta_turns_the_joints(make_env):
     env.reset()
     before = env.arm_state.joint_position.copy()
     action = torch.tensor([[0.5, 0, 0, 0, 0, 0, -0.5]])
-    env.step(env.fake_tensordict().select().set("action", action))
+    env.step(TensorDict({"action": action}, batch_size=env.batch_size))
     moved = (env.arm_state.joint_position - before)[0]
     # The motors close most, not all, of the gap within one control step.
     assert 0.02 < moved[0] < 0.055
@@ -134,10 +166,17 @@ def test_rotation_vector_takes_the_short_way():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: CartesianDelta(step=0), "step must be positive, got 0"),
+        (lambda: CartesianDelta(step=0), "step must be positive and finite, got 0"),
         (lambda: CartesianDelta(bound=-1), "bound must be positive, got -1"),
-        (lambda: JointDelta(step=float("nan")), "step must be positive, got nan"),
-        (lambda: DampedLeastSquares(damping=0), "damping must be positive, got 0"),
+        (lambda: CartesianDelta(orientation=(0, 0, 0, 0)), "orientation must be a unit quaternion"),
+        (lambda: CartesianDelta(orientation=(1, 0, 0)), r"orientation must have shape \(4,\)"),
+        (lambda: CartesianDelta(finger_step=0), "finger_step must be positive and finite, got 0"),
+        (lambda: JointDelta(step=float("nan")), "step must be positive and finite, got nan"),
+        (lambda: JointDelta(step=float("inf")), "step must be positive and finite, got inf"),
+        (lambda: DampedLeastSquares(damping=0), "damping must be positive and finite, got 0"),
+        (lambda: Scene(gravity=float("nan")), "gravity must be finite"),
+        (lambda: Scene(motor_gain=0), "motor_gain must be positive and finite, got 0"),
+        (lambda: ArmEnv(action=CartesianDelta(finger_step=1)), "finger_step moves free fingers"),
     ],
 )
 def test_bad_arguments(make, message):

@@ -1,8 +1,11 @@
 """ArmEnv as an environment: specs, seeds, resets, time limits, errors."""
 
+import copy
+import pickle
 import re
 
 import numpy as np
+import pybullet
 import pytest
 import torch
 from scripted import fly
@@ -12,6 +15,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.record import PixelRenderTransform
 
 from torchrl_safe.envs import (
+    PANDA,
     ArmEnv,
     CartesianDelta,
     Collision,
@@ -19,8 +23,11 @@ from torchrl_safe.envs import (
     InFront,
     JointDelta,
     NoObstacles,
+    Reach,
+    Scene,
 )
 
+ARMS = {"panda": PANDA}
 ACTIONS = [CartesianDelta(), JointDelta()]
 ROLLING = InFront(shape=Cylinder(mass=1.0))
 by_name = {"ids": lambda value: type(value).__name__}
@@ -41,15 +48,17 @@ def towards(env, point):
     return delta.float().clamp(-1, 1)
 
 
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
 @pytest.mark.parametrize("num_envs", [1, 3])
 @pytest.mark.parametrize("action", ACTIONS, **by_name)
 @pytest.mark.parametrize(
     "obstacles", [InFront(), ROLLING, NoObstacles()], ids=["fixed", "free", "none"]
 )
-def test_specs(make_env, num_envs, action, obstacles):
+def test_specs(make_env, arm, num_envs, action, obstacles):
     costs = {"collision": Collision(), "one": always(1)}
     env = make_env(
         ArmEnv,
+        arm,
         num_envs=num_envs,
         action=action,
         obstacles=obstacles,
@@ -71,10 +80,10 @@ def test_observation_fields(make_env):
     assert observation.shape[1] == max(field.stop for field in fields.values())
     np.testing.assert_allclose(observation[:, fields["ee_position"]], state.ee_position, atol=1e-6)
     np.testing.assert_allclose(
-        observation[:, fields["goal"]], state.goal - state.ee_position, atol=1e-6
+        observation[:, fields["to_goal"]], state.goal - state.ee_position, atol=1e-6
     )
     np.testing.assert_allclose(
-        observation[:, fields["obstacle_position"]],
+        observation[:, fields["to_obstacle"]],
         state.obstacle_position[:, 0] - state.ee_position,
         atol=1e-6,
     )
@@ -145,8 +154,13 @@ def test_partial_reset_leaves_the_other_worlds_alone(make_env):
             assert torch.equal(expected[key][1], got[key][1]), (index, key)
         if index % 3 == 2:
             before = got["observation"][1].clone()
+            state = disturbed.arm_state
             after = disturbed.reset(TensorDict({"_reset": mask, **got}, batch_size=[2]))
             assert torch.equal(after["observation"][1], before)
+            for field in ("joint_velocity", "obstacle_position", "contact_distance"):
+                kept = getattr(disturbed.arm_state, field)[1]
+                np.testing.assert_array_equal(kept, getattr(state, field)[1])
+            assert (disturbed.arm_state.contact_distance[0] == np.inf).all()
     # Row 0 did start again, with a new goal.
     assert not np.array_equal(alone.arm_state.goal[0], disturbed.arm_state.goal[0])
     assert np.array_equal(alone.arm_state.goal[1], disturbed.arm_state.goal[1])
@@ -192,28 +206,22 @@ def test_terminal_observation_is_true(make_env):
 
 def test_touch_in_the_middle_of_a_control_step_counts(make_env):
     """Each substep is read: a touch that is over at the end of the control step still costs."""
-    coarse = make_env(ArmEnv, frame_skip=12, seed=0)
+    settings = {"frame_skip": 12, "scene": Scene(motor_gain=0.1), "seed": 0}
+    coarse, fine = make_env(ArmEnv, **settings), make_env(ArmEnv, **settings)
     coarse.reset()
-    fine = make_env(ArmEnv, frame_skip=12, seed=0)
     fine.reset()
-    lost = 0
+    lost, cost = 0, 0
     for index in range(40):
-        # Into the obstacle and off it again.
-        aim = (
-            coarse.arm_state.obstacle_position[:, 0]
-            if index % 4 < 2
-            else np.array([[0.35, 0, 0.2]])
-        )
+        # Into the obstacle, and off it again as soon as it was touched.
+        aim = np.array([[0.35, 0, 0.3]]) if cost else coarse.arm_state.obstacle_position[:, 0]
         action = towards(coarse, aim)
         cost = step(coarse, action)["cost"].item()
         # The same motion by hand, one substep at a time.
-        joints, fingers = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._worlds)
-        touches = [
-            fine._worlds[0].advance(joints[0].tolist(), fingers[0].tolist(), 1)[0] <= 0
-            for _ in range(12)
-        ]
+        joints, _ = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._worlds)
+        joints = fine._within_speed(joints)
+        touches = [fine._worlds[0].advance(joints[0].tolist(), [], 1)[0] <= 0 for _ in range(12)]
         fine._rows = [fine._worlds[0].read()]
-        fine._state = fine._make_state(fine._no_contact())
+        fine._state = fine._make_state()
         assert cost == float(any(touches)), index
         lost += any(touches) and not touches[-1]
     assert lost > 0
@@ -266,21 +274,105 @@ def test_action_must_have_its_shape(make_env, shape):
         step(env, torch.zeros(shape))
 
 
+class Task(Reach):
+    """A task that returns whatever it is given."""
+
+    def __init__(self, **values):
+        super().__init__()
+        self.__dict__["values"] = values
+
+    def sample_goal(self, rng):
+        return self.values.get("goal", super().sample_goal(rng))
+
+    def reward(self, state):
+        return self.values.get("reward", super().reward(state))
+
+    def success(self, state):
+        return self.values.get("success", super().success(state))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"num_envs": 0}, "num_envs must be a whole number of at least 1, got 0"),
+        ({"num_envs": True}, "num_envs must be a whole number of at least 1, got True"),
         ({"frame_skip": 2.5}, "frame_skip must be a whole number of at least 1, got 2.5"),
         ({"max_episode_steps": -1}, "max_episode_steps must be a whole number"),
+        ({"seed": -1}, "seed must not be negative, got -1"),
         ({"costs": {}}, "costs must name at least one cost"),
         ({"costs": {"flat": lambda state: 0.0}}, r"cost 'flat' must have shape \(1,\), got \(\)"),
         ({"costs": {"nan": always("nan")}}, "cost 'nan' must be finite"),
+        ({"task": Task(goal=[0.6])}, r"goal must have shape \(3,\), got \(1,\)"),
+        ({"task": Task(goal=[0.6, 0, np.nan])}, "goal must be finite"),
+        ({"task": Task(reward=0.0)}, r"reward must have shape \(1,\), got \(\)"),
+        ({"task": Task(success=[[True]])}, r"success must have shape \(1,\), got \(1, 1\)"),
+        ({"observation": lambda s: {"x": s.goal[0]}}, r"observation field 'x' must have shape"),
+        ({"observation": lambda s: {"x": s.contact_distance}}, "observation field 'x' must be fin"),
+        ({"obstacles": InFront(gap=0.2)}, "obstacles must leave the arm free at home"),
+        ({"obstacles": InFront(gap=0.5)}, "gap must be less than the horizontal distance"),
     ],
-    ids=["num_envs", "frame_skip", "max_episode_steps", "no-costs", "cost-shape", "cost-nan"],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_bad_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         ArmEnv(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"arm": "panda"}, "arm must be an instance of ArmModel, got 'panda'"),
+        ({"action": "cartesian"}, "action must be an instance of ActionMode, got 'cartesian'"),
+        ({"task": Reach}, "task must be an instance of Task, got <class"),
+        ({"obstacles": Cylinder()}, "obstacles must be an instance of Obstacles"),
+        ({"scene": None}, "scene must be an instance of Scene, got None"),
+        ({"costs": [Collision()]}, "costs must be an instance of Mapping"),
+        ({"costs": {"c": Collision}}, "cost 'c' must be a callable object, got <class"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_arguments_of_the_wrong_kind(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        ArmEnv(**arguments)
+
+
+def test_numpy_integers_are_integers(make_env):
+    env = make_env(ArmEnv, num_envs=np.int64(2), frame_skip=np.int32(6))
+    assert env.num_envs == 2
+    assert env.control_rate == 40
+
+
+def test_closed_environment_says_so(make_env):
+    """Its server's number may belong to another environment by then."""
+    closed = ArmEnv(seed=0)
+    closed.reset()
+    closed.close()
+    other = make_env(ArmEnv, seed=0)
+    other.reset()
+    before = other._worlds[0].read()
+    for use in (lambda: step(closed, torch.ones(1, 3)), closed.reset, closed.render):
+        with pytest.raises(RuntimeError, match="This ArmEnv is closed"):
+            use()
+    with pytest.raises(pybullet.error, match="Not connected"):
+        closed._worlds[0].advance([0.0] * 7, [], 12)
+    assert other._worlds[0].read() == before
+
+
+@pytest.mark.parametrize("copier", [copy.deepcopy, pickle.dumps], ids=["deepcopy", "pickle"])
+def test_environments_are_not_copied(make_env, copier):
+    env = make_env(ArmEnv, seed=0)
+    with pytest.raises(TypeError, match="cannot be copied or pickled; pass a factory"):
+        copier(env)
+
+
+def test_default_dtype_does_not_matter(make_env):
+    torch.set_default_dtype(torch.float64)
+    try:
+        env = make_env(ArmEnv, num_envs=2, seed=0)
+        check_env_specs(env)
+        assert env.rollout(2)["next", "cost"].dtype == torch.float32
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_nan_cost_raises_at_the_step_where_it_appears(make_env):
@@ -307,7 +399,7 @@ def test_velocities_are_derivatives(make_env, action):
     env.reset()
     for _ in range(30):
         before = env.arm_state
-        step(env, torch.full(env.action_spec.shape, 0.5))
+        step(env, torch.full(env.action_spec.shape, 0.05))
         after = env.arm_state
         for position, velocity in (
             ("ee_position", "ee_velocity"),

@@ -26,7 +26,7 @@ def test_collision_without_obstacles_is_free():
     )
 
 
-@pytest.mark.parametrize("margin", [-0.01, float("nan")])
+@pytest.mark.parametrize("margin", [-0.01, 0.1, float("inf"), float("nan")])
 def test_collision_rejects_margin(margin):
-    with pytest.raises(ValueError, match=rf"margin must not be negative, got {margin}"):
+    with pytest.raises(ValueError, match=rf"margin must be between 0 and 0.02, .* got {margin}"):
         Collision(margin=margin)

@@ -38,12 +38,16 @@ def test_no_obstacles():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: InFront(gap=0), "gap must be positive, got 0"),
+        (lambda: InFront(gap=0), "gap must be positive and finite, got 0"),
+        (lambda: InFront(gap=float("inf")), "gap must be positive and finite, got inf"),
+        (lambda: InFront(height=float("nan")), "height must be finite"),
         (lambda: InFront(direction=(0, 0, 1)), "direction must be horizontal"),
         (lambda: InFront(direction=(0, 0, 0)), "direction must be horizontal and not zero"),
-        (lambda: Cylinder(radius=-1), "radius and height must be positive, got -1"),
-        (lambda: Cylinder(height=float("nan")), "radius and height must be positive"),
-        (lambda: Cylinder(mass=-1), "mass must not be negative, got -1"),
+        (lambda: InFront(direction=(1, 0)), r"direction must have shape \(3,\), got \(2,\)"),
+        (lambda: Cylinder(radius=-1), "radius must be positive and finite, got -1"),
+        (lambda: Cylinder(height=float("nan")), "height must be positive and finite, got nan"),
+        (lambda: Cylinder(mass=-1), "mass must be finite and not negative, got -1"),
+        (lambda: Cylinder(mass=float("inf")), "mass must be finite and not negative, got inf"),
     ],
 )
 def test_bad_arguments(make, message):

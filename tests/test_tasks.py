@@ -31,9 +31,12 @@ def test_goals_fill_the_box():
     ("arguments", "message"),
     [
         ({"low": (1, 0, 0), "high": (0, 1, 1)}, "low must not exceed high"),
-        ({"low": (float("nan"), 0, 0)}, "low must not exceed high"),
-        ({"radius": 0}, "radius must be positive, got 0"),
-        ({"radius": float("nan")}, "radius must be positive, got nan"),
+        ({"low": (float("nan"), 0, 0)}, "low must be finite"),
+        ({"high": (1, 1, float("inf"))}, "high must be finite"),
+        ({"low": (0.5,)}, r"low must have shape \(3,\), got \(1,\)"),
+        ({"radius": 0}, "radius must be positive and finite, got 0"),
+        ({"radius": float("nan")}, "radius must be positive and finite, got nan"),
+        ({"order": 0}, "order must be at least 1, got 0"),
     ],
 )
 def test_reach_rejects(arguments, message):

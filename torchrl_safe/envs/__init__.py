@@ -3,6 +3,7 @@
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
 from torchrl_safe.envs.arms import PANDA, ArmModel
+from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.kinematics import (
     BulletInverseKinematics,
@@ -38,6 +39,7 @@ __all__ = [
     "Reach",
     "Scene",
     "Task",
+    "World",
     "full_observation",
     "paper_env",
     "paper_observation",

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.checks import check_array, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.state import ArmState, Array
 
 
+@runtime_checkable
 class ActionMode(Protocol):
     """What :class:`~torchrl_safe.envs.ArmEnv` asks of an action representation."""
 
@@ -46,7 +48,8 @@ class CartesianDelta:
             per unit of action.
 
     Raises:
-        ValueError: if ``step`` or ``bound`` is not positive.
+        ValueError: if ``step``, ``bound`` or ``finger_step`` is not positive, or
+            ``orientation`` is not a unit quaternion.
 
     Examples:
         >>> CartesianDelta(step=0.03).width(num_joints=7)
@@ -60,7 +63,16 @@ class CartesianDelta:
     finger_step: float | None = None
 
     def __post_init__(self) -> None:
-        _check_positive(step=self.step, bound=self.bound)
+        check_positive(step=self.step)
+        _check_bound(self.bound)
+        if self.orientation is not None:
+            length = np.linalg.norm(check_array("orientation", self.orientation, (4,)))
+            if not np.isclose(length, 1, atol=1e-3):
+                raise ValueError(
+                    f"orientation must be a unit quaternion (x, y, z, w), got {self.orientation}."
+                )
+        if self.finger_step is not None:
+            check_positive(finger_step=self.finger_step)
 
     def width(self, num_joints: int) -> int:
         return 3 if self.finger_step is None else 4
@@ -73,9 +85,13 @@ class CartesianDelta:
         joints = self.inverse_kinematics(position, np.asarray(orientation), state, worlds)
         if self.finger_step is None:
             return joints, np.zeros((len(action), 0))
-        return joints, np.repeat(
-            self.finger_step * action[:, 3:], state.finger_position.shape[1], axis=1
-        )
+        fingers = state.finger_position.shape[1]
+        if not fingers:
+            raise ValueError(
+                f"finger_step moves free fingers, got {self.finger_step} and a Scene without "
+                "free_fingers."
+            )
+        return joints, np.repeat(self.finger_step * action[:, 3:], fingers, axis=1)
 
 
 @dataclass(frozen=True)
@@ -100,7 +116,8 @@ class JointDelta:
     respect_limits: bool = True
 
     def __post_init__(self) -> None:
-        _check_positive(step=self.step, bound=self.bound)
+        check_positive(step=self.step)
+        _check_bound(self.bound)
 
     def width(self, num_joints: int) -> int:
         return num_joints
@@ -114,7 +131,6 @@ class JointDelta:
         return joints, np.zeros((len(action), 0))
 
 
-def _check_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not value > 0:
-            raise ValueError(f"{name} must be positive, got {value}.")
+def _check_bound(bound: float) -> None:
+    if not bound > 0:
+        raise ValueError(f"bound must be positive, got {bound}.")

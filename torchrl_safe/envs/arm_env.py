@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta
 from torchrl_safe.envs.arms import PANDA, ArmModel
 from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.checks import check_array, check_count, check_kind
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.observations import full_observation
 from torchrl_safe.envs.obstacles import InFront, Obstacles
@@ -64,8 +66,10 @@ class ArmEnv(EnvBase):
         gui (bool, optional): show the first world in PyBullet's window. Defaults to ``False``.
 
     Raises:
-        ValueError: if an argument is not usable, or an action, reward or cost is NaN or has
-            the wrong shape.
+        TypeError: if an argument is not of its kind.
+        ValueError: if an argument is not usable, an action, observation, reward or cost is not
+            finite or has the wrong shape, or the obstacles overlap the arm at home.
+        RuntimeError: if the environment is closed.
 
     Examples:
         >>> env = ArmEnv(num_envs=2, seed=0)
@@ -98,22 +102,25 @@ class ArmEnv(EnvBase):
         device: torch.device | str | None = None,
         gui: bool = False,
     ) -> None:
-        for name, number in (
-            ("num_envs", num_envs),
-            ("frame_skip", frame_skip),
-            ("max_episode_steps", max_episode_steps),
-        ):
-            if not (isinstance(number, int) and number >= 1):
-                raise ValueError(f"{name} must be a whole number of at least 1, got {number!r}.")
-        costs = {"collision": Collision()} if costs is None else dict(costs)
+        check_count(num_envs=num_envs, frame_skip=frame_skip, max_episode_steps=max_episode_steps)
+        check_kind("arm", arm, ArmModel)
+        check_kind("action", action, ActionMode)
+        check_kind("task", task, Task)
+        check_kind("obstacles", obstacles, Obstacles)
+        check_kind("scene", scene, Scene)
+        costs = {"collision": Collision()} if costs is None else costs
+        check_kind("costs", costs, Mapping)
         if not costs:
             raise ValueError("costs must name at least one cost, got an empty mapping.")
+        for name, cost in costs.items():
+            if isinstance(cost, type) or not callable(cost):
+                raise TypeError(f"cost {name!r} must be a callable object, got {cost!r}.")
         super().__init__(device=device, batch_size=(num_envs,))
         self.arm = arm
         self.action_mode = action
         self.task = task
         self.obstacles = obstacles
-        self.costs = costs
+        self.costs = dict(costs)
         self.frame_skip = frame_skip
         self.max_episode_steps = max_episode_steps
         self._observation = observation
@@ -123,20 +130,23 @@ class ArmEnv(EnvBase):
         self._obstacle_size = np.array([s.half_extents for s in shapes]).reshape(-1, 3)
         self._elapsed = np.zeros(num_envs, dtype=int)
         self._rows: list[tuple[float, ...]] = [()] * num_envs
+        self._contact_distance = np.full((num_envs, len(shapes)), np.inf)
+        self.set_seed(seed)
         self._worlds: list[World] = []
         try:
             for index in range(num_envs):
                 self._worlds.append(World(arm, scene, shapes, gui=gui and index == 0))
+            self._check_starts()
             self._make_specs()
         except BaseException:
             self._close_worlds()
             raise
-        self.set_seed(seed)
+        self.is_closed = False
 
     @property
     def num_envs(self) -> int:
         """Number of worlds."""
-        return len(self._worlds)
+        return self.batch_size[0]
 
     @property
     def cost_names(self) -> tuple[str, ...]:
@@ -153,34 +163,54 @@ class ArmEnv(EnvBase):
         """Actions a second, Hz."""
         return 1 / (SUBSTEP * self.frame_skip)
 
+    def _check_starts(self) -> None:
+        # Goals that leave the obstacles no room show here rather than after hours of training.
+        generator = np.random.default_rng(0)
+        for _ in range(100):
+            self._reset_world(0, generator)
+            if (clearance := self._worlds[0].clearance()) <= 0:
+                raise ValueError(
+                    f"obstacles must leave the arm free at home, got an overlap of "
+                    f"{-clearance:.4f} m from {self.obstacles}."
+                )
+
     def _make_specs(self) -> None:
-        # Everything the arguments can get wrong shows here, before anything is lost.
         for row in range(self.num_envs):
             self._reset_world(row, np.random.default_rng(0))
-        self._state = self._make_state(self._no_contact())
-        self._costs_of(self._state)
-        fields = self._observation(self._state)
+        self._state = state = self._make_state()
+        # What the arguments compute is checked here once, so that it fails at the door.
+        joints = state.joint_position.shape[1]
+        width = self.action_mode.width(joints)
+        check_array(
+            "joint targets of the action",
+            self.action_mode.targets(np.zeros((self.num_envs, width)), state, self._worlds)[0],
+            (self.num_envs, joints),
+        )
+        self._outcome(state)
+        fields = self._observation(state)
+        for name, field in fields.items():
+            check_array(f"observation field {name!r}", field, (self.num_envs, *field.shape[1:2]))
         ends = np.cumsum([field.shape[1] for field in fields.values()])
         self.observation_fields = {
             name: slice(int(end) - field.shape[1], int(end))
             for (name, field), end in zip(fields.items(), ends, strict=True)
         }
         batch, device = self.batch_size, self.device
+        unbounded = partial(Unbounded, device=device, dtype=torch.float32)
         self.observation_spec = Composite(
-            observation=Unbounded((*batch, int(ends[-1])), device=device),
+            observation=unbounded((*batch, int(ends[-1]))),
             success=Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device),
             shape=batch,
         )
-        shape = (*batch, self.action_mode.width(self._state.joint_position.shape[1]))
         bound = self.action_mode.bound
         self.action_spec = (
-            Bounded(-bound, bound, shape, device=device, dtype=torch.float32)
+            Bounded(-bound, bound, (*batch, width), device=device, dtype=torch.float32)
             if np.isfinite(bound)
-            else Unbounded(shape, device=device)
+            else unbounded((*batch, width))
         )
         self.reward_spec = Composite(
-            reward=Unbounded((*batch, 1), device=device),
-            cost=Unbounded((*batch, len(self.costs)), device=device),
+            reward=unbounded((*batch, 1)),
+            cost=unbounded((*batch, len(self.costs))),
             shape=batch,
         )
         self.done_spec = Composite(
@@ -192,46 +222,52 @@ class ArmEnv(EnvBase):
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        self._check_open()
         chosen = None if tensordict is None else tensordict.get("_reset", None)
         rows = range(self.num_envs) if chosen is None else chosen.flatten().nonzero().flatten()
         for row in rows:
             self._reset_world(int(row), self._generators[int(row)])
-        self._state = self._make_state(self._no_contact())
+        self._state = self._make_state()
         return self._pack(
             observation=self._observe(self._state),
             success=np.zeros((self.num_envs, 1), dtype=bool),
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_open()
         action = self._check_action(tensordict.get("action"))
         joints, fingers = self.action_mode.targets(action, self._state, self._worlds)
-        distances = [
-            world.advance(joint_target, finger_target, self.frame_skip)
-            for world, joint_target, finger_target in zip(
-                self._worlds, joints.tolist(), fingers.tolist(), strict=True
+        if self._scene.motor_limits:
+            joints = self._within_speed(joints)
+        for row, (world, joint_target, finger_target) in enumerate(
+            zip(self._worlds, joints.tolist(), fingers.tolist(), strict=True)
+        ):
+            self._contact_distance[row] = world.advance(
+                joint_target, finger_target, self.frame_skip
             )
-        ]
-        self._rows = [world.read() for world in self._worlds]
+            self._rows[row] = world.read()
         self._elapsed += 1
-        self._state = state = self._make_state(np.reshape(distances, (self.num_envs, -1)))
-        success = self.task.success(state)[:, None]
+        self._state = state = self._make_state()
+        reward, cost, success = self._outcome(state)
         truncated = (self._elapsed >= self.max_episode_steps)[:, None] & ~success
         return self._pack(
             observation=self._observe(state),
             success=success,
-            reward=_checked("reward", self.task.reward(state), self.num_envs)[:, None],
-            cost=self._costs_of(state),
+            reward=reward,
+            cost=cost,
             terminated=success,
             truncated=truncated,
             done=success | truncated,
         )
 
-    def _set_seed(self, seed: int | None) -> None:
+    def _set_seed(self, seed: int | None) -> int | None:
+        if seed is not None and seed < 0:
+            raise ValueError(f"seed must not be negative, got {seed}.")
         self._generators = []
         for _ in range(self.num_envs):
             self._generators.append(np.random.default_rng(seed))
             seed = None if seed is None else seed_generator(seed)
-        self._next_seed = seed
+        return seed
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seeds every row and returns the seed for the next environment.
@@ -239,8 +275,8 @@ class ArmEnv(EnvBase):
         TorchRL's own method advances its chain of seeds by one; this one advances it by one
         for each row, so that the rows of the next worker do not repeat those of this one.
         """
-        self._set_seed(seed)
-        return seed if static_seed else self._next_seed
+        following = self._set_seed(seed)
+        return seed if static_seed else following
 
     def render(self, width: int = 320, height: int = 240, camera: Camera = Camera()) -> Tensor:
         """Draws every world.
@@ -252,7 +288,12 @@ class ArmEnv(EnvBase):
 
         Returns:
             RGB pictures, uint8, shape ``(N, height, width, 3)``.
+
+        Raises:
+            ValueError: if a size is not a whole number of at least 1.
         """
+        check_count(width=width, height=height)
+        self._check_open()
         if self._picture_world is None:
             self._picture_world = World(self.arm, self._scene, self.obstacles.shapes, visuals=True)
         pictures = []
@@ -271,6 +312,10 @@ class ArmEnv(EnvBase):
         if self._picture_world is not None:
             self._picture_world.close()
 
+    def _check_open(self) -> None:
+        if self.is_closed:
+            raise RuntimeError("This ArmEnv is closed.")
+
     def _check_action(self, action: Tensor) -> Array:
         shape = self.action_spec.shape
         if action.shape != shape:
@@ -281,18 +326,28 @@ class ArmEnv(EnvBase):
             raise ValueError(f"action must be finite, got NaN or infinity in rows {rows}.")
         return np.clip(array, -self.action_mode.bound, self.action_mode.bound)
 
+    def _within_speed(self, joints: Array) -> Array:
+        # All joints are slowed alike, so that the tool keeps to its path.
+        change = joints - self._state.joint_position
+        longest = self._worlds[0].joint_speed / self.control_rate
+        slowdown = np.maximum(1, np.abs(change / longest).max(axis=1, keepdims=True))
+        return self._state.joint_position + change / slowdown
+
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:
         world = self._worlds[row]
-        goal = self.task.sample_goal(generator)
+        goal = check_array("goal", self.task.sample_goal(generator), (3,))
         start = np.array(world.home_position)
-        world.reset(self.obstacles.sample(generator, start, goal), goal)
+        places = check_array(
+            "obstacle positions",
+            self.obstacles.sample(generator, start, goal),
+            self._obstacle_size.shape,
+        )
+        world.reset(places, goal)
         self._rows[row] = world.read(fresh=True)
+        self._contact_distance[row] = np.inf
         self._elapsed[row] = 0
 
-    def _no_contact(self) -> Array:
-        return np.full((self.num_envs, len(self._obstacle_size)), np.inf)
-
-    def _make_state(self, contact_distance: Array) -> ArmState:
+    def _make_state(self) -> ArmState:
         table = np.array(self._rows)
         widths = self._worlds[0].widths()
         columns = np.split(table, np.cumsum([*widths.values()])[:-1], axis=1)
@@ -304,18 +359,21 @@ class ArmEnv(EnvBase):
             joint_lower=self._worlds[0].joint_lower,
             joint_upper=self._worlds[0].joint_upper,
             obstacle_size=self._obstacle_size,
-            contact_distance=contact_distance,
+            contact_distance=self._contact_distance.copy(),
         )
 
     def _observe(self, state: ArmState) -> Array:
-        return np.concatenate([*self._observation(state).values()], axis=1)
+        fields = self._observation(state).values()
+        observation = np.concatenate([*fields], axis=1)
+        return check_array("observation", observation, observation.shape)
 
-    def _costs_of(self, state: ArmState) -> Array:
-        columns = [
-            _checked(f"cost {name!r}", cost(state), self.num_envs)
-            for name, cost in self.costs.items()
-        ]
-        return np.stack(columns, axis=1)
+    def _outcome(self, state: ArmState) -> tuple[Array, Array, np.ndarray]:
+        """Reward (N, 1), costs (N, k) and success (N, 1) of a state."""
+        shape = (self.num_envs,)
+        costs = [check_array(f"cost {name!r}", c(state), shape) for name, c in self.costs.items()]
+        reward = check_array("reward", self.task.reward(state), shape)
+        success = check_array("success", self.task.success(state), shape)
+        return reward[:, None], np.stack(costs, axis=1), success[:, None] > 0
 
     def _pack(self, **arrays: np.ndarray) -> TensorDict:
         tensors = {
@@ -323,11 +381,3 @@ class ArmEnv(EnvBase):
             for name, array in arrays.items()
         }
         return TensorDict(tensors, batch_size=self.batch_size, device=self.device)
-
-
-def _checked(name: str, values: Array, num_envs: int) -> Array:
-    if np.shape(values) != (num_envs,):
-        raise ValueError(f"{name} must have shape ({num_envs},), got {np.shape(values)}.")
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name} must be finite, got {values}.")
-    return values

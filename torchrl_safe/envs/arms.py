@@ -20,9 +20,12 @@ class ArmModel:
         finger_home: position of the joints that are not part of the arm, in metres, where they
             are free.
 
+    A file, link or home pose that does not fit raises ValueError where the world is built.
+
     Examples:
-        >>> ArmModel("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", home=(0, 0.6, 0, -1.4, 0, 1.1, 0))
-        ArmModel(urdf='kuka_iiwa/model.urdf', ...)
+        >>> iiwa = ArmModel("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", (0, 0.4, 0, -2, 0, 0.74, 0))
+        >>> iiwa.ee_link
+        'lbr_iiwa_link_7'
     """
 
     urdf: str

@@ -6,6 +6,7 @@ import tempfile
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pybullet
@@ -47,14 +48,39 @@ class World:
     ) -> None:
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self._client < 0:
-            raise RuntimeError("PyBullet could not open another world (a process can hold 1024).")
-        # Client numbers are reused, so each is disconnected exactly once, by its owner.
-        self.close = weakref.finalize(self, pybullet.disconnect, self._client)
+            raise RuntimeError(
+                "PyBullet opened no world: a process can hold 1024, one of them with a window."
+            )
+        # PyBullet reuses client numbers: each is disconnected once, by its owner.
+        self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
         try:
             self._build(arm, scene, shapes, visuals or gui)
         except BaseException:
             self.close()
             raise
+
+    def close(self) -> None:
+        """Shuts the server down; afterwards every other method raises ``pybullet.error``."""
+        self._disconnect()
+        self._client = -1
+
+    def __reduce__(self) -> NoReturn:
+        # A copy would drive, and in the end disconnect, the server of this one.
+        raise TypeError(
+            "A simulated world cannot be copied or pickled; pass a factory, such as "
+            "functools.partial(ArmEnv, num_envs=8)."
+        )
+
+    def clearance(self) -> float:
+        """Returns the smallest distance between arm and obstacles, up to 0.1 m."""
+        points = [
+            point[8]
+            for body in self._obstacles
+            for point in pybullet.getClosestPoints(
+                self._arm, body, 0.1, physicsClientId=self._client
+            )
+        ]
+        return min(points, default=0.1)
 
     def _build(
         self, arm: ArmModel, scene: Scene, shapes: Sequence[Cylinder], visuals: bool
@@ -126,8 +152,9 @@ class World:
         ]
         movable = [info for info in infos if info[2] != pybullet.JOINT_FIXED]
         joints = [info for info in movable if info[1].decode() in chain]
+        fingers = [info for info in movable if info[1].decode() not in chain]
         self._joints = [info[0] for info in joints]
-        self._fingers = [info[0] for info in movable if info[1].decode() not in chain]
+        self._fingers = [info[0] for info in fingers]
         # Bullet's Jacobian and inverse kinematics speak of all movable joints.
         self._columns = [movable.index(info) for info in joints]
         self._num_movable = len(movable)
@@ -135,7 +162,8 @@ class World:
         unlimited = [info[8] >= info[9] for info in joints]
         self.joint_lower = np.where(unlimited, -np.inf, [info[8] for info in joints])
         self.joint_upper = np.where(unlimited, np.inf, [info[9] for info in joints])
-        self._efforts = [info[10] or _UNLIMITED_EFFORT for info in joints]
+        self.joint_speed = np.array([info[11] or np.inf for info in joints])
+        self._efforts = [info[10] or _UNLIMITED_EFFORT for info in joints + fingers]
         if len(arm.home) != len(joints):
             raise ValueError(
                 f"home must give {len(joints)} joint angles, one for each movable joint up to "
@@ -205,7 +233,7 @@ class World:
             there was no contact.
         """
         client = self._client
-        self._command(joint_target, finger_target)
+        self._command(joint_target, finger_target, self._scene.motor_gain or 1 / substeps)
         distances = [float("inf")] * len(self._obstacles)
         for _ in range(substeps):
             pybullet.stepSimulation(physicsClientId=client)
@@ -215,16 +243,18 @@ class World:
                     distances[index] = min(distances[index], point[8])
         return distances
 
-    def _command(self, joint_target: Sequence[float], finger_target: Sequence[float]) -> None:
-        joints, targets = self._joints, list(joint_target)
-        if finger_target:
-            joints, targets = [*joints, *self._fingers], [*targets, *finger_target]
-        limits = {"forces": self._efforts} if self._scene.effort_limits else {}
+    def _command(
+        self, joint_target: Sequence[float], finger_target: Sequence[float], gain: float
+    ) -> None:
+        targets = [*joint_target, *finger_target]
+        count = len(targets)
+        limits = {"forces": self._efforts[:count]} if self._scene.motor_limits else {}
         pybullet.setJointMotorControlArray(
             self._arm,
-            joints,
+            (self._joints + self._fingers)[:count],
             pybullet.POSITION_CONTROL,
             targetPositions=targets,
+            positionGains=[gain] * count,
             physicsClientId=self._client,
             **limits,
         )

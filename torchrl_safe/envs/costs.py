@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from torchrl_safe.envs.state import ArmState, Array
 
+#: Distance from which on PyBullet reports contact points, m.
+CONTACT_RANGE = 0.02
+
 
 @dataclass(frozen=True)
 class Collision:
@@ -15,11 +18,11 @@ class Collision:
     and ends between two control steps is not lost.
 
     Args:
-        margin: distance in metres up to which a contact point counts as a touch. PyBullet
-            reports contact points up to about 0.02 m before the bodies meet.
+        margin: distance up to which a contact point counts as a touch, m. PyBullet reports
+            contact points from 0.02 m before the bodies meet.
 
     Raises:
-        ValueError: if ``margin`` is negative.
+        ValueError: if ``margin`` is not between 0 and 0.02.
 
     Examples:
         >>> Collision()
@@ -29,8 +32,11 @@ class Collision:
     margin: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.margin >= 0:
-            raise ValueError(f"margin must not be negative, got {self.margin}.")
+        if not 0 <= self.margin <= CONTACT_RANGE:
+            raise ValueError(
+                f"margin must be between 0 and {CONTACT_RANGE}, where PyBullet reports contacts, "
+                f"got {self.margin}."
+            )
 
     def __call__(self, state: ArmState) -> Array:
         """Returns the cost of each world, shape ``(N,)``."""

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.checks import check_positive
 from torchrl_safe.envs.state import ArmState, Array
 
 
@@ -44,13 +45,16 @@ class DampedLeastSquares:
 
     Raises:
         ValueError: if ``damping`` is not positive.
+
+    Examples:
+        >>> DampedLeastSquares(damping=0.1)
+        DampedLeastSquares(damping=0.1)
     """
 
     damping: float = 0.05
 
     def __post_init__(self) -> None:
-        if not self.damping > 0:
-            raise ValueError(f"damping must be positive, got {self.damping}.")
+        check_positive(damping=self.damping)
 
     def __call__(
         self, position: Array, orientation: Array, state: ArmState, worlds: Sequence[World]

@@ -8,13 +8,22 @@ from torchrl_safe.envs.state import ArmState, Array
 
 
 def full_observation(state: ArmState) -> dict[str, Array]:
-    """Everything the reaching task needs to be Markov; positions relative to the tool point.
+    """What reaching past fixed obstacles needs to be Markov.
+
+    Of an obstacle that is free to fall over, its orientation is left out.
 
     Returns:
         The fields, in order: ``joint_position`` (rad), ``joint_velocity`` (rad/s),
-        ``ee_position`` (m), ``ee_velocity`` (m/s), ``goal`` (m, relative), and for all obstacles
-        ``obstacle_position`` (m, relative), ``obstacle_size`` (half extents, m) and
-        ``obstacle_velocity`` (m/s).
+        ``ee_position`` (m), ``ee_velocity`` (m/s), ``to_goal`` (from the tool point, m), and for
+        all obstacles ``to_obstacle`` (from the tool point, m), ``obstacle_size`` (half extents,
+        m) and ``obstacle_velocity`` (m/s).
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> env = ArmEnv(observation=full_observation)
+        >>> env.observation_fields["to_goal"]
+        slice(20, 23, None)
+        >>> env.close()
     """
     rows = len(state.ee_position)
     relative = state.obstacle_position - state.ee_position[:, None]
@@ -23,8 +32,8 @@ def full_observation(state: ArmState) -> dict[str, Array]:
         "joint_velocity": state.joint_velocity,
         "ee_position": state.ee_position,
         "ee_velocity": state.ee_velocity,
-        "goal": state.goal - state.ee_position,
-        "obstacle_position": relative.reshape(rows, -1),
+        "to_goal": state.goal - state.ee_position,
+        "to_obstacle": relative.reshape(rows, -1),
         "obstacle_size": np.tile(state.obstacle_size.reshape(1, -1), (rows, 1)),
         "obstacle_velocity": state.obstacle_velocity.reshape(rows, -1),
     }

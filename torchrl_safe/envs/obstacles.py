@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from torchrl_safe.envs.checks import check_array, check_positive
 from torchrl_safe.envs.state import Array
 
 
@@ -21,6 +22,10 @@ class Cylinder:
 
     Raises:
         ValueError: if a size is not positive or the mass is negative.
+
+    Examples:
+        >>> Cylinder(radius=0.04, height=0.3).half_extents
+        (0.04, 0.04, 0.15)
     """
 
     radius: float = 0.05
@@ -28,12 +33,9 @@ class Cylinder:
     mass: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.radius > 0 and self.height > 0):
-            raise ValueError(
-                f"radius and height must be positive, got {self.radius} and {self.height}."
-            )
-        if not self.mass >= 0:
-            raise ValueError(f"mass must not be negative, got {self.mass}.")
+        check_positive(radius=self.radius, height=self.height)
+        if not 0 <= self.mass < np.inf:
+            raise ValueError(f"mass must be finite and not negative, got {self.mass}.")
 
     @property
     def half_extents(self) -> tuple[float, float, float]:
@@ -41,6 +43,7 @@ class Cylinder:
         return (self.radius, self.radius, self.height / 2)
 
 
+@runtime_checkable
 class Obstacles(Protocol):
     """What :class:`~torchrl_safe.envs.ArmEnv` asks of a layout of obstacles."""
 
@@ -85,17 +88,22 @@ class InFront:
     height: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.gap > 0:
-            raise ValueError(f"gap must be positive, got {self.gap}.")
-        if self.direction is not None and (self.direction[2] != 0 or not any(self.direction)):
-            raise ValueError(f"direction must be horizontal and not zero, got {self.direction}.")
+        check_positive(gap=self.gap)
+        if self.direction is not None:
+            direction = check_array("direction", self.direction, (3,))
+            if direction[2] != 0 or not direction.any():
+                raise ValueError(
+                    f"direction must be horizontal and not zero, got {self.direction}."
+                )
+        if self.height is not None:
+            check_array("height", self.height, ())
 
     @property
     def shapes(self) -> tuple[Cylinder, ...]:
         return (self.shape,)
 
     def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Array:
-        way = np.array(goal - start if self.direction is None else self.direction)
+        way = np.array(goal - start if self.direction is None else self.direction, dtype=float)
         way[2] = 0
         length = np.linalg.norm(way)
         if self.direction is None and length <= self.gap:
@@ -110,7 +118,12 @@ class InFront:
 
 @dataclass(frozen=True)
 class NoObstacles:
-    """An empty table."""
+    """An empty table.
+
+    Examples:
+        >>> NoObstacles().shapes
+        ()
+    """
 
     @property
     def shapes(self) -> tuple[Cylinder, ...]:

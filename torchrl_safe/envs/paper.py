@@ -9,7 +9,7 @@ from typing import Any
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
 from torchrl_safe.envs.arms import PANDA
-from torchrl_safe.envs.costs import Collision
+from torchrl_safe.envs.costs import CONTACT_RANGE, Collision
 from torchrl_safe.envs.kinematics import BulletInverseKinematics
 from torchrl_safe.envs.observations import paper_observation
 from torchrl_safe.envs.obstacles import Cylinder, InFront
@@ -57,11 +57,11 @@ def paper_env(action: ActionMode = PAPER_CARTESIAN, **kwargs: Any) -> ArmEnv:
     """
     arm = replace(PANDA, home=(0, -0.215, 0, -2.57, 0, 2.356, 2.356), finger_home=0.08)
     settings: dict[str, Any] = {
+        "arm": arm,
         "action": action,
         "task": Reach(low=(0.6, -0.2, 0.05), high=(0.8, 0.2, 0.05), radius=0.09, order=1),
         "obstacles": InFront(gap=0.2, shape=Cylinder(mass=1.0), direction=(1, 0, 0), height=0.05),
-        # PyBullet's contact points reach 0.02 m beyond the surfaces.
-        "costs": {"collision": Collision(margin=0.02)},
+        "costs": {"collision": Collision(margin=CONTACT_RANGE)},
         "observation": paper_observation,
         "frame_skip": 1,
         "max_episode_steps": 500,
@@ -70,9 +70,10 @@ def paper_env(action: ActionMode = PAPER_CARTESIAN, **kwargs: Any) -> ArmEnv:
             furniture=(("plane.urdf", (0, 0, -0.65)), ("table/table.urdf", (0.5, 0, -0.65))),
             target_urdf="lego/lego.urdf",
             free_fingers=True,
-            effort_limits=False,
+            motor_limits=False,
+            motor_gain=0.1,
             urdf_inertia=True,
             fresh_links=False,
         ),
     }
-    return ArmEnv(arm, **{**settings, **kwargs})
+    return ArmEnv(**{**settings, **kwargs})

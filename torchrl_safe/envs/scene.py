@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torchrl_safe.envs.checks import check_array, check_positive
+
 #: Duration of one physics substep, s (PyBullet's default).
 SUBSTEP = 1 / 240
 
@@ -19,24 +21,50 @@ class Scene:
         target_urdf: body of the target, free to move; the goal is then read from the
             simulator. ``None`` makes the target a mere point.
         free_fingers: leave the joints that are not part of the arm movable.
-        effort_limits: limit the motors to the efforts of the URDF.
+        motor_limits: keep the motors within the efforts and speeds of the URDF.
+        motor_gain: share of the way to the joint targets that the motors ask for in each
+            physics substep. ``None`` asks for the speed that is there at the end of the control
+            step.
         urdf_inertia: take inertias from the URDF instead of from the collision shapes.
         fresh_links: read the tool pose of the current joint angles. ``False`` reads it one
             physics substep late, as PyBullet does unless told otherwise.
+
+    Raises:
+        ValueError: if ``gravity`` is not finite or ``motor_gain`` is not positive.
+
+    Examples:
+        >>> Scene(gravity=1.62).motor_limits
+        True
     """
 
     gravity: float = 9.81
     furniture: tuple[tuple[str, tuple[float, float, float]], ...] = ()
     target_urdf: str | None = None
     free_fingers: bool = False
-    effort_limits: bool = True
+    motor_limits: bool = True
+    motor_gain: float | None = None
     urdf_inertia: bool = False
     fresh_links: bool = True
+
+    def __post_init__(self) -> None:
+        check_array("gravity", self.gravity, ())
+        if self.motor_gain is not None:
+            check_positive(motor_gain=self.motor_gain)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where :meth:`~torchrl_safe.envs.ArmEnv.render` looks from; lengths in metres."""
+    """Where :meth:`~torchrl_safe.envs.ArmEnv.render` looks from.
+
+    Args:
+        eye: position of the camera, m.
+        target: the point it looks at, m.
+        field_of_view: vertical, degrees.
+
+    Examples:
+        >>> Camera(eye=(0.4, -1.5, 0.4)).field_of_view
+        45.0
+    """
 
     eye: tuple[float, float, float] = (1.0, -1.25, 0.7)
     target: tuple[float, float, float] = (0.3, 0.0, 0.3)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_safe.envs.checks import check_array, check_positive
 from torchrl_safe.envs.state import ArmState, Array
 
 
+@runtime_checkable
 class Task(Protocol):
     """What :class:`~torchrl_safe.envs.ArmEnv` asks of a task."""
 
@@ -38,23 +40,25 @@ class Reach:
         order: order of the distance's norm: 2 is Euclidean, 1 is the paper's.
 
     Raises:
-        ValueError: if the box is empty or ``radius`` is not positive.
+        ValueError: if the box is empty, ``radius`` is not positive or ``order`` is less than 1.
 
     Examples:
         >>> Reach(radius=0.03)
-        Reach(low=(0.55, -0.2, 0.05), high=(0.7, 0.2, 0.15), radius=0.03, order=2)
+        Reach(low=(0.6, -0.2, 0.05), high=(0.7, 0.2, 0.15), radius=0.03, order=2)
     """
 
-    low: tuple[float, float, float] = (0.55, -0.2, 0.05)
+    low: tuple[float, float, float] = (0.6, -0.2, 0.05)
     high: tuple[float, float, float] = (0.7, 0.2, 0.15)
     radius: float = 0.05
     order: float = 2
 
     def __post_init__(self) -> None:
-        if not np.all(np.asarray(self.low) <= np.asarray(self.high)):
+        low, high = check_array("low", self.low, (3,)), check_array("high", self.high, (3,))
+        if not np.all(low <= high):
             raise ValueError(f"low must not exceed high, got {self.low} and {self.high}.")
-        if not self.radius > 0:
-            raise ValueError(f"radius must be positive, got {self.radius}.")
+        check_positive(radius=self.radius)
+        if not self.order >= 1:
+            raise ValueError(f"order must be at least 1, got {self.order}.")
 
     def sample_goal(self, rng: np.random.Generator) -> Array:
         return rng.uniform(self.low, self.high)

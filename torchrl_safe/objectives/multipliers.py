@@ -30,6 +30,17 @@ class MultiplierUpdater(abc.ABC):
 
     Raises:
         ValueError: if the loss has no such buffer, or a limit or bound is not usable.
+
+    Examples:
+        >>> import torch
+        >>> class Exponentiated(MultiplierUpdater):
+        ...     def next_multiplier(self, multiplier, violation):
+        ...         return multiplier * violation.exp()
+        >>> loss = LossModule()
+        >>> loss.register_buffer("lagrange_multiplier", torch.ones(1))
+        >>> Exponentiated(loss, cost_limit=2.0, max_multiplier=2.5).step(torch.tensor([[3.0]]))
+        >>> loss.lagrange_multiplier
+        tensor([2.5000])
     """
 
     def __init__(
@@ -70,9 +81,8 @@ class MultiplierUpdater(abc.ABC):
             ValueError: if the shape is wrong or a cost is NaN or infinite; nothing has changed
                 then.
 
-        Examples:
-            >>> # as collectors and RewardSum give it:
-            >>> # updater.step(batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)])
+        With :class:`~torchrl.envs.RewardSum` a collector's batch gives it as
+        ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``.
         """
         multiplier = self.loss_module.lagrange_multiplier
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != multiplier.shape:
@@ -86,6 +96,10 @@ class MultiplierUpdater(abc.ABC):
             return
         mean_cost = episode_cost.to(multiplier).mean(0)
         proposal = self.next_multiplier(multiplier, mean_cost - self.cost_limit.to(multiplier))
+        if proposal.shape != multiplier.shape or not proposal.isfinite().all():
+            raise ValueError(
+                f"next_multiplier must return {len(multiplier)} finite numbers, got {proposal}."
+            )
         multiplier.copy_(proposal.clamp(0, self.max_multiplier))
 
     @abc.abstractmethod
@@ -105,7 +119,16 @@ class MultiplierUpdater(abc.ABC):
         return {"cost_limit": self.cost_limit.clone(), "max_multiplier": self.max_multiplier}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Loads a state that :meth:`state_dict` returned."""
+        """Loads a state that :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if the state is of another number of costs.
+        """
+        if state_dict["cost_limit"].shape != self.cost_limit.shape:
+            raise ValueError(
+                f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "
+                f"{len(self.cost_limit)}."
+            )
         self.cost_limit = state_dict["cost_limit"].clone()
         self.max_multiplier = state_dict["max_multiplier"]
 
@@ -134,6 +157,10 @@ class DualAscent(MultiplierUpdater):
             ``torch.distributions.transforms.SoftplusTransform()``. As published, the gradient
             is that of the parameter times the violation, without the transform's derivative.
             Defaults to the identity: the multiplier itself.
+
+    Raises:
+        ValueError: if ``lr`` is not positive, or ``parametrization`` cannot give the multiplier
+            to start with.
 
     Examples:
         >>> import torch

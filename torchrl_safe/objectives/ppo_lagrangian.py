@@ -60,6 +60,10 @@ class PPOLagrangianLoss(ClipPPOLoss):
             Defaults to ``1.0``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
+    Raises:
+        ValueError: if ``num_costs`` or ``multiplier_init`` is not usable; in a call, if the cost
+            critic or the costs have another width than ``num_costs``.
+
     Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
     ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
 
@@ -164,7 +168,13 @@ class PPOLagrangianLoss(ClipPPOLoss):
 
         Returns:
             The loss itself.
+
+        Raises:
+            TypeError: if ``estimator`` is no estimator.
+            ValueError: if both an estimator and hyperparameters are given.
         """
+        if not isinstance(estimator, ValueEstimatorBase | None):
+            raise TypeError(f"estimator must be a ValueEstimatorBase, got {estimator!r}.")
         if estimator is None:
             device = self.lagrange_multiplier.device
             hyperparams = {"gamma": 0.99, "lmbda": 0.95, "device": device, **hyperparams}
@@ -208,9 +218,9 @@ class PPOLagrangianLoss(ClipPPOLoss):
             target_params=self.target_critic_network_params,
         )
         advantage = tensordict.get(self.tensor_keys.advantage)
-        tensordict.set(
-            self.tensor_keys.advantage, self._standardize_advantage(advantage, tensordict)
-        )
+        if advantage.numel() > 1:
+            advantage = self._standardize_advantage(advantage, tensordict)
+        tensordict.set(self.tensor_keys.advantage, advantage)
         return self._estimate_cost_advantage(tensordict)
 
     def _estimate_cost_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:

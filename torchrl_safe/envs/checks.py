@@ -1,0 +1,44 @@
+"""Checks of what comes in; each error names the argument and the value."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numpy as np
+
+from torchrl_safe.envs.state import Array
+
+
+def check_positive(**values: float) -> None:
+    """Raises ValueError unless each value is positive and finite."""
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} must be positive and finite, got {value}.")
+
+
+def check_count(**values: int) -> None:
+    """Raises ValueError unless each value is a whole number of at least 1."""
+    for name, value in values.items():
+        try:
+            usable = not isinstance(value, bool) and operator.index(value) >= 1
+        except TypeError:
+            usable = False
+        if not usable:
+            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
+
+
+def check_kind(name: str, value: Any, kind: type) -> None:
+    """Raises TypeError unless the value is an object of a class or protocol, not a class."""
+    if isinstance(value, type) or not isinstance(value, kind):
+        raise TypeError(f"{name} must be an instance of {kind.__name__}, got {value!r}.")
+
+
+def check_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+    """Returns the values as an array; raises ValueError unless they have a shape and are finite."""
+    array = np.asarray(values, dtype=float)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}.")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {array}.")
+    return array
