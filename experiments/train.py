@@ -79,6 +79,9 @@ class Config:
     """Discount of reward and cost."""
     multiplier_rate: float = 0.2
     """Multiplier added for each unit of violated cost, once a batch."""
+    margin: float = 0.4
+    """Share of the cost limit held back in training. A limit that binds is met on average only:
+    policies trained for exactly the limit are found above it about as often as below."""
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs")
@@ -90,6 +93,8 @@ class Config:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
         if not 0 <= self.cost_limit < math.inf:
             raise ValueError(f"cost_limit must not be negative, got {self.cost_limit}.")
+        if not 0 <= self.margin < 1:
+            raise ValueError(f"margin must be at least 0 and less than 1, got {self.margin}.")
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
         for name, divisor in (("envs", "workers"), ("frames_per_batch", "envs")):
@@ -172,7 +177,8 @@ def train(config: Config, algorithm: str) -> tuple[ProbabilisticActor, list[dict
     """Trains with one algorithm; returns the policy and a row of figures for each batch."""
     torch.manual_seed(config.seed)
     actor, loss = make_agent(config)
-    updater = DualAscent(loss, cost_limit=config.cost_limit, lr=config.multiplier_rate)
+    target = (1 - config.margin) * config.cost_limit
+    updater = DualAscent(loss, cost_limit=target, lr=config.multiplier_rate)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate)
     batches = math.ceil(config.frames / config.frames_per_batch)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=batches)

@@ -81,7 +81,6 @@ def test_batched_environments_draw_what_one_environment_draws():
         got = split.rollout(
             10, lambda td: td.set("action", next(two)[:, None]), break_when_any_done=False
         )
-        # Not the first episode: SerialEnv has reset its worlds once more to learn their specs.
         for key in ("observation", ("next", "reward"), ("next", "cost")):
             assert torch.equal(expected[key], got[key][:, 0]), key
     finally:

@@ -98,6 +98,7 @@ def test_help_names_the_options():
         ({"workers": 0}, "workers must be at least 1, got 0"),
         ({"envs": 5, "workers": 2}, "envs must be a multiple of workers, got 5 and 2"),
         ({"envs": 6, "workers": 2}, "frames_per_batch must be a multiple of envs"),
+        ({"margin": 1.0}, "margin must be at least 0 and less than 1, got 1.0"),
         ({"minibatch": 0}, "minibatch must be at least 1, got 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be positive, got nan"),
         ({"cost_limit": -1.0}, "cost_limit must not be negative, got -1.0"),

@@ -146,6 +146,21 @@ class World:
                 )
             except pybullet.error as error:
                 raise ValueError(f"urdf {arm.urdf!r} does not load in PyBullet.") from error
+        self._find_joints(chain, arm.ee_link)
+        if len(arm.home) != len(self._joints):
+            raise ValueError(
+                f"home must give {len(self._joints)} joint angles, one for each movable joint up "
+                f"to {arm.ee_link!r}, got {len(arm.home)}."
+            )
+        if not np.all((self.joint_lower <= arm.home) & (arm.home <= self.joint_upper)):
+            raise ValueError(
+                f"home must be within the joint limits {self.joint_lower.tolist()} and "
+                f"{self.joint_upper.tolist()}, got {arm.home}."
+            )
+
+    def _find_joints(self, chain: set[str], ee_link: str) -> None:
+        """Sorts the joints into those of the arm and free fingers, and reads their limits."""
+        client = self._client
         infos = [
             pybullet.getJointInfo(self._arm, j, physicsClientId=client)
             for j in range(pybullet.getNumJoints(self._arm, physicsClientId=client))
@@ -158,22 +173,12 @@ class World:
         # Bullet's Jacobian and inverse kinematics speak of all movable joints.
         self._columns = [movable.index(info) for info in joints]
         self._num_movable = len(movable)
-        self._ee = next(info[0] for info in infos if info[12].decode() == arm.ee_link)
+        self._ee = next(info[0] for info in infos if info[12].decode() == ee_link)
         unlimited = [info[8] >= info[9] for info in joints]
         self.joint_lower = np.where(unlimited, -np.inf, [info[8] for info in joints])
         self.joint_upper = np.where(unlimited, np.inf, [info[9] for info in joints])
         self.joint_speed = np.array([info[11] or np.inf for info in joints])
         self._efforts = [info[10] or _UNLIMITED_EFFORT for info in joints + fingers]
-        if len(arm.home) != len(joints):
-            raise ValueError(
-                f"home must give {len(joints)} joint angles, one for each movable joint up to "
-                f"{arm.ee_link!r}, got {len(arm.home)}."
-            )
-        if not np.all((self.joint_lower <= arm.home) & (arm.home <= self.joint_upper)):
-            raise ValueError(
-                f"home must be within the joint limits {self.joint_lower.tolist()} and "
-                f"{self.joint_upper.tolist()}, got {arm.home}."
-            )
         # The tool point in the frame of the link's centre of mass, where Bullet wants it.
         _, _, com, com_orientation, *_ = self._link_state(fresh=True)
         self._tool_in_com = pybullet.invertTransform(com, com_orientation)[0]
