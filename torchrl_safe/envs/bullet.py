@@ -6,7 +6,7 @@ import tempfile
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import pybullet
@@ -53,8 +53,10 @@ class World:
             )
         # PyBullet reuses client numbers: each is disconnected once, by its owner.
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
+        self._scene = scene
+        self._visuals = visuals or gui
         try:
-            self._build(arm, scene, shapes, visuals or gui)
+            self._build(arm, shapes)
         except BaseException:
             self.close()
             raise
@@ -82,20 +84,26 @@ class World:
         ]
         return min(points, default=0.1)
 
-    def _build(
-        self, arm: ArmModel, scene: Scene, shapes: Sequence[Cylinder], visuals: bool
-    ) -> None:
-        client = self._client
-        self._scene = scene
+    def _build(self, arm: ArmModel, shapes: Sequence[Cylinder]) -> None:
+        client, scene = self._client, self._scene
         pybullet.setGravity(0, 0, -scene.gravity, physicsClientId=client)
         # Contacts then do not depend on the order in which bodies came close.
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        self._load_furniture(visuals)
-        self._load_arm(arm, visuals)
-        self._obstacles = [self._load_cylinder(shape, visuals) for shape in shapes]
+        self._load_furniture()
+        self._load_arm(arm)
+        self._obstacles = [
+            self._add_body(
+                _RED,
+                pybullet.GEOM_CYLINDER,
+                mass=shape.mass,
+                radius=shape.radius,
+                height=shape.height,
+            )
+            for shape in shapes
+        ]
         self._is_static = [shape.mass == 0 for shape in shapes]
         self._brick = None if scene.target_urdf is None else self._load_brick(scene.target_urdf)
-        self._marker = self._load_marker() if visuals and self._brick is None else None
+        self._marker = self._load_marker() if self._visuals and self._brick is None else None
         bodies = zip(self._obstacles, self._is_static, strict=True)
         self._movable = [body for body, static in bodies if not static]
         if self._brick is not None:
@@ -111,7 +119,7 @@ class World:
         #: Tool point, m, and tool orientation, a quaternion (x, y, z, w), at home.
         self.home_position, self.home_orientation = link[4], link[5]
 
-    def _load_furniture(self, visuals: bool) -> None:
+    def _load_furniture(self) -> None:
         client = self._client
         data = Path(pybullet_data.getDataPath())
         for urdf, position in self._scene.furniture:
@@ -119,21 +127,14 @@ class World:
         if self._scene.furniture:
             return
         size = (0.75, 0.6, 0.025)
-        table = pybullet.createCollisionShape(
-            pybullet.GEOM_BOX, halfExtents=size, physicsClientId=client
-        )
-        skin = -1
-        if visuals:
-            skin = pybullet.createVisualShape(
-                pybullet.GEOM_BOX, halfExtents=size, rgbaColor=_WOOD, physicsClientId=client
-            )
+        self._add_body(_WOOD, pybullet.GEOM_BOX, position=(0.5, 0, -size[2]), halfExtents=size)
+        if self._visuals:
             pybullet.loadURDF(str(data / "plane.urdf"), (0, 0, -0.7), physicsClientId=client)
-        pybullet.createMultiBody(0, table, skin, (0.5, 0, -size[2]), physicsClientId=client)
 
-    def _load_arm(self, arm: ArmModel, visuals: bool) -> None:
+    def _load_arm(self, arm: ArmModel) -> None:
         path = Path(pybullet_data.getDataPath()) / arm.urdf
         text, chain = prepare_urdf(
-            path, arm.ee_link, visuals=visuals, fix_fingers=not self._scene.free_fingers
+            path, arm.ee_link, visuals=self._visuals, fix_fingers=not self._scene.free_fingers
         )
         client = self._client
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE if self._scene.urdf_inertia else 0
@@ -183,24 +184,25 @@ class World:
         _, _, com, com_orientation, *_ = self._link_state(fresh=True)
         self._tool_in_com = pybullet.invertTransform(com, com_orientation)[0]
 
-    def _load_cylinder(self, shape: Cylinder, visuals: bool) -> int:
+    def _add_body(
+        self,
+        colour: Sequence[float],
+        geometry: int,
+        *,
+        mass: float = 0.0,
+        position: Sequence[float] = _LIMBO,
+        **size: Any,
+    ) -> int:
         client = self._client
-        body = pybullet.createCollisionShape(
-            pybullet.GEOM_CYLINDER,
-            radius=shape.radius,
-            height=shape.height,
-            physicsClientId=client,
-        )
+        shape = pybullet.createCollisionShape(geometry, physicsClientId=client, **size)
         skin = -1
-        if visuals:
+        if self._visuals:
+            # PyBullet calls the same measure "height" of a shape and "length" of its skin.
+            size = {"length" if name == "height" else name: size[name] for name in size}
             skin = pybullet.createVisualShape(
-                pybullet.GEOM_CYLINDER,
-                radius=shape.radius,
-                length=shape.height,
-                rgbaColor=_RED,
-                physicsClientId=client,
+                geometry, rgbaColor=colour, physicsClientId=client, **size
             )
-        return pybullet.createMultiBody(shape.mass, body, skin, _LIMBO, physicsClientId=client)
+        return pybullet.createMultiBody(mass, shape, skin, position, physicsClientId=client)
 
     def _load_brick(self, urdf: str) -> int:
         path = Path(pybullet_data.getDataPath()) / urdf
