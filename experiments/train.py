@@ -9,12 +9,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from time import perf_counter, strftime
 from typing import Any, Literal
 
 import torch
@@ -61,8 +61,10 @@ class Config:
     """Processes that simulate; with 1 this process does."""
     seed: int = 0
     """Seed of networks, environments and minibatches."""
-    out: Path = Path("runs/train")
-    """Folder for logs, checkpoints, results.json and pictures."""
+    out: Path = dataclasses.field(
+        default_factory=lambda: Path("runs", strftime("%Y-%m-%d_%H-%M-%S"))
+    )
+    """New folder for logs, checkpoints, results.json and pictures; named by date and time."""
     logger: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
     """TorchRL logger; wandb and mlflow are to be installed by you."""
     eval_episodes: int = 256
@@ -239,6 +241,8 @@ def main(config: Config) -> None:
     torchrl_logger.setLevel("WARNING")
     # The networks are small: more threads than one only wait for each other.
     torch.set_num_threads(1)
+    if config.out.exists() and any(config.out.iterdir()):
+        raise FileExistsError(f"out must be a new or empty folder, got {str(config.out)!r}.")
     config.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, Any] = {
         "config": dataclasses.asdict(config),
@@ -248,9 +252,9 @@ def main(config: Config) -> None:
     env, stage = make_env(config, num_envs=32), make_env(config, num_envs=1, seed=config.seed)
     save_picture(stage, config.out / "scene.png")
     for algorithm in config.algorithms:
-        start = time.perf_counter()
+        start = perf_counter()
         actor, history = train(config, algorithm)
-        seconds = time.perf_counter() - start
+        seconds = perf_counter() - start
         # Seeds that training does not use.
         episodes = evaluate(env, actor, config.eval_episodes, seed=config.seed + 1_000_000)
         results["algorithms"][algorithm] = {

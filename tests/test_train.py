@@ -81,6 +81,15 @@ def test_checkpoint_holds_the_loss(finished):
     )
 
 
+def test_a_run_is_not_written_over(finished):
+    out, _ = finished
+    before = (out / "results.json").read_bytes()
+    done = run("--out", out)
+    assert done.returncode != 0
+    assert "out must be a new or empty folder" in done.stderr
+    assert (out / "results.json").read_bytes() == before
+
+
 def test_help_names_the_options():
     done = run("--help")
     assert done.returncode == 0
