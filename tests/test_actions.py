@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from states import make_state
 from tensordict import TensorDict
 
 from torchrl_safe.envs import (
@@ -80,6 +81,25 @@ def test_one_step_of_least_squares_lands_near_the_target():
         check.close()
 
 
+def test_damping_and_limits_hold_the_joints_back_near_a_singular_pose():
+    """Undamped, a stretched arm that is told to stretch would turn its joints by radians."""
+    world = World(PANDA, Scene(), ())
+    try:
+        world._set_joints([0.0, 0.0, 0.0, -0.08, 0.0, 0.08, 0.0])
+        state = state_of(world)
+        target = state.ee_position + np.array([[0.0, 0.0, 0.05]])
+        unbounded = np.full(7, np.inf)
+        state.joint_lower, state.joint_upper = -unbounded, unbounded
+        angles = DampedLeastSquares()(target, state.ee_orientation[0], state, [world])
+        assert np.abs(angles - state.joint_position).max() < 0.5
+        # The limits hold whatever the step would be.
+        state.joint_lower, state.joint_upper = state.joint_position[0] + [[-0.01], [0.01]]
+        held = DampedLeastSquares()(target, state.ee_orientation[0], state, [world])
+        np.testing.assert_array_equal(held, np.clip(angles, state.joint_lower, state.joint_upper))
+    finally:
+        world.close()
+
+
 def test_jacobian_is_the_derivative_of_the_tool_point():
     world = World(PANDA, Scene(free_fingers=True), ())
     try:
@@ -128,6 +148,43 @@ def test_joints_keep_to_the_speeds_of_the_urdf(make_env, action):
             env.step(TensorDict({"action": actions}, batch_size=[8]))
             fastest = max(fastest, (np.abs(env.arm_state.joint_velocity) / limit).max())
     assert 0.5 < fastest < 1.3
+
+
+def test_tool_keeps_the_orientation_it_is_given(make_env):
+    """Here that of the paper, tilted by 0.3 rad about the world's x axis."""
+    tilt = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
+    c, s = math.cos(0.15), math.sin(0.15)
+    wanted = (c * tilt[0], c * tilt[1], s * tilt[1], -s * tilt[0])
+    env = make_env(ArmEnv, action=CartesianDelta(orientation=wanted), obstacles=NoObstacles())
+    env.reset()
+    state = drive(env, np.array([[0.5, 0.0, 0.25]]), 40)
+    assert np.abs(state.ee_orientation[0] @ np.array(wanted)) > 0.9999
+
+
+@pytest.mark.parametrize(("respect", "expected"), [(True, 2.0), (False, 2.5)])
+def test_joint_targets_respect_limits_if_wanted(respect, expected):
+    state = make_state(joint_position=np.full((2, 7), 1.5))
+    action = JointDelta(step=1.0, respect_limits=respect)
+    joints, fingers = action.targets(np.ones((2, 7)), state, ())
+    np.testing.assert_array_equal(joints, np.full((2, 7), expected))
+    assert fingers.shape == (2, 0)
+
+
+def test_all_joints_are_slowed_alike_and_worlds_one_by_one(make_env):
+    """So that the tool keeps to its path, whatever the other worlds do."""
+    settings = {"action": JointDelta(step=1.0), "obstacles": NoObstacles()}
+    both, alone = make_env(ArmEnv, num_envs=2, **settings), make_env(ArmEnv, **settings)
+    # World 0 asks for 20 and 10 rad/s, of which 2.175 are to be had; world 1 for 1 rad/s.
+    action = torch.zeros(2, 7)
+    action[0, 0], action[0, 6], action[1, 6] = 1.0, -0.5, 0.05
+    for env, actions in ((both, action), (alone, action[1:])):
+        env.reset()
+        env.step(TensorDict({"action": actions}, batch_size=env.batch_size))
+    moved = both.arm_state.joint_position - PANDA.home
+    assert moved[0, 0] / moved[0, 6] == pytest.approx(-2, abs=0.3)
+    np.testing.assert_array_equal(
+        both.arm_state.joint_position[1], alone.arm_state.joint_position[0]
+    )
 
 
 def test_fingers_follow_with_motor_limits(make_env):

@@ -29,6 +29,7 @@ from torchrl_safe.envs import (
 
 ARMS = {"panda": PANDA}
 ACTIONS = [CartesianDelta(), JointDelta()]
+TWO = (Cylinder(), Cylinder())
 ROLLING = InFront(shape=Cylinder(mass=1.0))
 by_name = {"ids": lambda value: type(value).__name__}
 
@@ -46,6 +47,16 @@ def towards(env, point):
     """The action that moves the tool towards a point, as fast as it can."""
     delta = torch.as_tensor(point - env.arm_state.ee_position) / env.action_mode.step
     return delta.float().clamp(-1, 1)
+
+
+class Places:
+    """A layout of obstacles that stand wherever they are put."""
+
+    def __init__(self, *places, shapes=TWO):
+        self.places, self.shapes = np.array(places), shapes
+
+    def sample(self, rng, start, goal):
+        return self.places
 
 
 @pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
@@ -90,6 +101,28 @@ def test_observation_fields(make_env):
     np.testing.assert_allclose(observation[:, fields["obstacle_size"]], [[0.05, 0.05, 0.1]] * 2)
 
 
+def test_observation_of_two_obstacles(make_env):
+    """All of the first, then all of the second, each relative to the tool."""
+    places = [[0.7, 0.3, 0.1], [0.7, -0.4, 0.15]]
+    layout = Places(*places, shapes=(Cylinder(), Cylinder(radius=0.06, height=0.3)))
+    env = make_env(ArmEnv, num_envs=2, obstacles=layout)
+    observation = env.reset()["observation"].numpy()
+    state, fields = env.arm_state, env.observation_fields
+    relative = [np.subtract(places, tool).flatten() for tool in state.ee_position]
+    np.testing.assert_allclose(observation[:, fields["to_obstacle"]], relative, atol=1e-6)
+    sizes = [[0.05, 0.05, 0.1, 0.06, 0.06, 0.15]] * 2
+    np.testing.assert_allclose(observation[:, fields["obstacle_size"]], sizes, atol=1e-6)
+
+
+def test_observation_of_motion(make_env):
+    env = make_env(ArmEnv, obstacles=NoObstacles(), seed=0)
+    env.reset()
+    observation = step(env, torch.tensor([[1.0, -1.0, 0.5]]))["observation"][0].numpy()
+    for name in ("joint_position", "joint_velocity", "ee_velocity"):
+        field = observation[env.observation_fields[name]]
+        np.testing.assert_allclose(field, getattr(env.arm_state, name)[0], atol=1e-5)
+
+
 @pytest.mark.parametrize("obstacles", [InFront(), ROLLING], ids=["fixed", "free"])
 @pytest.mark.parametrize("action", ACTIONS, **by_name)
 def test_same_seed_same_rollout_bit_for_bit(make_env, action, obstacles):
@@ -110,6 +143,23 @@ def test_same_seed_same_rollout_bit_for_bit(make_env, action, obstacles):
     assert one["next", "done"].any()
     for key in one.keys(True, True):
         assert torch.equal(one[key], two[key]), key
+
+
+def test_reset_forgets_the_obstacle_it_is_pushing(make_env):
+    """Bullet keeps contact points over a restored state, unless they are taken away first."""
+
+    def push(env, steps):
+        env.reset()
+        for _ in range(steps):
+            result = step(env, towards(env, env.arm_state.obstacle_position[:, 0]))
+            yield result["observation"], result["cost"]
+
+    fresh, used = (make_env(ArmEnv, obstacles=ROLLING, seed=seed) for seed in (7, 99))
+    *_, (_, cost) = push(used, 20)
+    assert cost.all(), "it is reset while it touches"
+    used.set_seed(7)
+    for expected, got in zip(push(fresh, 25), push(used, 25), strict=True):
+        assert all(map(torch.equal, expected, got))
 
 
 def test_other_seed_other_goals(make_env):
@@ -136,6 +186,19 @@ def test_rows_are_seeded_as_workers_are(make_env):
     np.testing.assert_array_equal(
         both.arm_state.goal, np.concatenate([one.arm_state.goal, two.arm_state.goal])
     )
+
+
+def test_static_seed_stays(make_env):
+    env = make_env(ArmEnv)
+    assert env.set_seed(3, static_seed=True) == 3
+    assert env.set_seed(3) != 3
+
+
+def test_costs_keep_their_order(make_env):
+    env = make_env(ArmEnv, num_envs=2, costs={"two": always(2), "one": always(1)})
+    env.reset()
+    assert step(env, torch.zeros(2, 3))["cost"].tolist() == [[2, 1]] * 2
+    assert env.cost_names == ("two", "one")
 
 
 def test_partial_reset_leaves_the_other_worlds_alone(make_env):
@@ -174,6 +237,17 @@ def test_time_limit_truncates(make_env):
     assert torch.equal(rollout["next", "done"].squeeze(-1), truncated)
     assert not rollout["next", "terminated"].any()
     assert not rollout["next", "success"].any()
+
+
+def test_success_at_the_time_limit_is_no_truncation(make_env):
+    """Else a critic would bootstrap from a state in which the task is done."""
+    home = (0.35, 0, 0.2)
+    task = Reach(low=home, high=home)
+    env = make_env(ArmEnv, task=task, obstacles=NoObstacles(), max_episode_steps=1)
+    assert not env.reset()["success"], "not before the first step"
+    result = step(env, torch.zeros(1, 3))
+    for key, value in (("success", 1), ("terminated", 1), ("truncated", 0), ("done", 1)):
+        assert result[key].item() == value, key
 
 
 def test_success_terminates(make_env):
@@ -225,6 +299,18 @@ def test_touch_in_the_middle_of_a_control_step_counts(make_env):
         assert cost == float(any(touches)), index
         lost += any(touches) and not touches[-1]
     assert lost > 0
+
+
+def test_states_and_resets_do_not_remember_touches(make_env):
+    env = make_env(ArmEnv, seed=0)
+    env.reset()
+    start = env.arm_state
+    while not step(env, towards(env, env.arm_state.obstacle_position[:, 0]))["cost"]:
+        assert env._elapsed < 40
+    # A state is a record: what comes after it does not change it.
+    assert start.contact_distance == np.inf
+    env.reset()
+    assert env.arm_state.contact_distance == np.inf
 
 
 def test_the_obstacle_stands_in_the_way_and_can_be_passed(make_env):
@@ -308,6 +394,8 @@ class Task(Reach):
         ({"task": Task(success=[[True]])}, r"success must have shape \(1,\), got \(1, 1\)"),
         ({"observation": lambda s: {"x": s.goal[0]}}, r"observation field 'x' must have shape"),
         ({"observation": lambda s: {"x": s.contact_distance}}, "observation field 'x' must be fin"),
+        ({"obstacles": Places([0.7, 0, 0])}, r"obstacle positions must have shape \(2, 3\), got"),
+        ({"obstacles": Places([0.7, 0, 0], [np.nan] * 3)}, "obstacle positions must be finite"),
         ({"obstacles": InFront(gap=0.2)}, "obstacles must leave the arm free at home"),
         ({"obstacles": InFront(gap=0.5)}, "gap must be less than the horizontal distance"),
     ],
@@ -428,3 +516,25 @@ def test_pixels_in_a_rollout(make_env):
     pixels = env.rollout(2)["next", "pixels"]
     assert pixels.shape == (2, 2, 24, 32, 3)
     assert pixels.float().std() > 10
+
+
+def test_pictures_show_the_arm_and_the_target(make_env):
+    env = make_env(ArmEnv, num_envs=2, obstacles=NoObstacles(), seed=0)
+
+    def targets(pixels):
+        """Where the yellow marker of each world is: row and column."""
+        yellow = (pixels[..., 0] > 150) & (pixels[..., 1] > 120) & (pixels[..., 2] < 90)
+        assert yellow.flatten(1).any(1).all(), "the target is in the picture"
+        return [picture.nonzero().float().mean(0) for picture in yellow]
+
+    env.reset()
+    before = env.render(width=96, height=96)
+    one, two = targets(before)
+    assert (one - two).abs().max() > 2, "each world has its own target"
+    wide = env.render(width=192, height=96)
+    assert torch.equal(wide[:, :, 48:144], before), "more width shows more, at the same scale"
+    for _ in range(10):
+        step(env, torch.tensor([[1.0, 1, 1], [0, 0, 0]]))
+    changed = (env.render(width=96, height=96).int() - before.int()).abs().sum(-1) > 60
+    assert changed[0].sum() > 200
+    assert changed[1].sum() < 20

@@ -2,13 +2,15 @@
 
 import dataclasses
 import gc
+import math
 
+import numpy as np
 import pybullet
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_safe.envs import PANDA, ArmEnv
+from torchrl_safe.envs import PANDA, ArmEnv, ArmModel, Cylinder, InFront, JointDelta, NoObstacles
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.scene import Scene
 
@@ -61,6 +63,17 @@ def test_open_and_close_leaves_nothing():
     assert open_clients() == before
 
 
+def test_closing_closes_the_world_of_the_pictures():
+    before = open_clients()
+    env = ArmEnv(seed=0)
+    env.reset()
+    env.render(width=8, height=8)
+    env.close()
+    assert open_clients() == before
+    # Closed, not merely forgotten.
+    assert env.is_closed
+
+
 def test_forgotten_world_is_closed():
     before = open_clients()
     world = World(PANDA, Scene(), ())
@@ -93,3 +106,113 @@ def test_bad_arm_raises_and_leaves_no_server(arm, message):
     with pytest.raises(ValueError, match=message):
         World(arm, Scene(), ())
     assert open_clients() == before
+
+
+# An arm whose tool link has its centre of mass elsewhere and turned, unlike the Panda's, and
+# joints without limits of angle, speed or effort.
+LEVER = """<robot name="lever">
+<link name="base"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
+<link name="beam"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
+<link name="tip">
+  <inertial>
+    <origin xyz="0.1 0.2 0.05" rpy="0.3 0.5 0"/><mass value="1"/>
+    <inertia ixx="1" iyy="2" izz="3"/>
+  </inertial>
+  <collision><geometry><box size="0.02 0.02 0.02"/></geometry></collision>
+</link>
+<joint name="turn" type="continuous">
+  <parent link="base"/><child link="beam"/><axis xyz="0 0 1"/>
+</joint>
+<joint name="swing" type="continuous">
+  <origin xyz="0.5 0 0.3"/><parent link="beam"/><child link="tip"/><axis xyz="0 1 0"/>
+</joint>
+</robot>"""
+
+
+@pytest.fixture
+def lever(tmp_path):
+    path = tmp_path / "lever.urdf"
+    path.write_text(LEVER)
+    return ArmModel(str(path), "tip", home=(0.2, 0.4))
+
+
+def test_tool_point_is_the_origin_of_the_link(make_env, lever):
+    """Not its centre of mass: pose and velocity as by hand."""
+    settings = {"frame_skip": 1, "obstacles": NoObstacles()}
+    env = make_env(ArmEnv, lever, action=JointDelta(step=0.05), **settings)
+    env.reset()
+    for _ in range(20):
+        action = torch.tensor([[1.0, -0.5]])
+        env.step(TensorDict({"action": action}, batch_size=[1]))
+    state = env.arm_state
+    (turn, swing), (turning, _) = state.joint_position[0], state.joint_velocity[0]
+    np.testing.assert_allclose([turn, swing], [1.2, -0.1], atol=1e-3)
+    x, y = 0.5 * math.cos(turn), 0.5 * math.sin(turn)
+    np.testing.assert_allclose(state.ee_position, [[x, y, 0.3]], atol=1e-5)
+    np.testing.assert_allclose(state.ee_velocity / turning, [[-y, x, 0]], atol=1e-5)
+    (c, d), (s, t) = (np.cos([turn / 2, swing / 2]), np.sin([turn / 2, swing / 2]))
+    np.testing.assert_allclose(state.ee_orientation, [[-s * t, c * t, s * d, c * d]], atol=1e-5)
+
+
+def test_jacobian_is_that_of_the_origin_of_the_link(lever):
+    turn, swing = 1.2, -0.1
+    x, y = 0.5 * math.cos(turn), 0.5 * math.sin(turn)
+    expected = [[-y, 0], [x, 0], [0, 0], [0, -math.sin(turn)], [0, math.cos(turn)], [1, 0]]
+    world = World(lever, Scene(), ())
+    try:
+        np.testing.assert_allclose(world.jacobian([turn, swing]), expected, atol=1e-5)
+    finally:
+        world.close()
+
+
+def test_joints_without_limits(lever):
+    world = World(lever, Scene(), ())
+    try:
+        assert (world.joint_lower == -np.inf).all()
+        assert (world.joint_upper == np.inf).all()
+        assert (world.joint_speed == np.inf).all()
+    finally:
+        world.close()
+
+
+@pytest.mark.parametrize("from_urdf", [True, False])
+def test_inertia_is_that_of_the_urdf_if_wanted(lever, from_urdf):
+    world = World(lever, Scene(urdf_inertia=from_urdf), ())
+    try:
+        inertia = pybullet.getDynamicsInfo(world._arm, 1, physicsClientId=world._client)[2]
+        assert (inertia == (1, 2, 3)) == from_urdf
+    finally:
+        world.close()
+
+
+def test_free_obstacle_falls_onto_the_table(make_env):
+    layout = InFront(shape=Cylinder(mass=1.0), height=0.2)
+    env = make_env(ArmEnv, obstacles=layout, scene=Scene(gravity=1.62), seed=0)
+    env.reset()
+    still = TensorDict({"action": torch.zeros(1, 3)}, batch_size=[1])
+    observation = env.step(still.clone())["next", "observation"].numpy()
+    # After 0.05 s, by gravity and with Bullet's little drag.
+    np.testing.assert_allclose(env.arm_state.obstacle_velocity, [[[0, 0, -0.081]]], atol=2e-4)
+    fall = observation[:, env.observation_fields["obstacle_velocity"]]
+    np.testing.assert_allclose(fall, env.arm_state.obstacle_velocity[:, 0], atol=1e-6)
+    for _ in range(40):
+        env.step(still.clone())
+    # It stands 0.2 m high on a table whose top is at height 0.
+    assert env.arm_state.obstacle_position[0, 0, 2] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_picture_world_takes_joints_and_poses():
+    one, two = (World(PANDA, Scene(), (Cylinder(mass=1.0),)) for _ in range(2))
+    try:
+        lying = ((0.6, 0.1, 0.05), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
+        one._set_joints(np.array(PANDA.home) + 0.1)
+        one._place(one._obstacles[0], *lying)
+        two.copy_from(one)
+        assert two._joint_states() == one._joint_states() != ()
+        np.testing.assert_allclose(
+            np.concatenate(two._pose(two._obstacles[0])), [*lying[0], *lying[1]]
+        )
+        np.testing.assert_allclose([s[0] for s in two._joint_states()], np.array(PANDA.home) + 0.1)
+    finally:
+        one.close()
+        two.close()

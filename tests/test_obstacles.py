@@ -19,6 +19,17 @@ def test_in_front_of_the_paper():
     np.testing.assert_allclose(centre, [0.5, 0.1, 0.05])
 
 
+def test_direction_has_no_length():
+    """It only points; and as it does not depend on the start, neither does the room for it."""
+    layout = InFront(gap=0.2, direction=(0, 5, 0), shape=Cylinder(height=0.3))
+    (centre,) = layout.sample(RNG, np.array([0.7, 0, 0.5]), np.array([0.7, 0.1, 0.05]))
+    np.testing.assert_allclose(centre, [0.7, -0.1, 0.15], atol=1e-12)
+    slow = InFront(gap=0.2, direction=(0, 0.1, 0), shape=Cylinder(height=0.3))
+    np.testing.assert_allclose(
+        slow.sample(RNG, np.zeros(3), np.array([0.7, 0.1, 0.05])), [[0.7, -0.1, 0.15]], atol=1e-12
+    )
+
+
 def test_sampling_leaves_the_goal_alone():
     goal = np.array([0.7, 0.1, 0.05])
     InFront().sample(RNG, np.zeros(3), goal)

@@ -7,13 +7,14 @@ costs and returns of scripted policies), with tolerances for their number of epi
 import math
 
 import numpy as np
+import pybullet
 import pytest
 import torch
 from scripted import fly
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, paper_env
+from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, Collision, paper_env
 
 
 def step(env, action):
@@ -58,6 +59,15 @@ def test_brick_falls_and_obstacle_is_pushed_out_of_the_table(make_env):
     np.testing.assert_allclose(env.arm_state.obstacle_position[:, 0, 2], 0.076, atol=2e-3)
 
 
+def test_brick_falls_with_10_m_per_s2(make_env):
+    env = make_env(paper_env, seed=0)
+    env.reset()
+    for _ in range(12):
+        step(env, still(env))
+    fallen = 10 * (1 / 240) ** 2 * sum(range(1, 13))
+    np.testing.assert_allclose(env.arm_state.goal[0, 2], 0.05 - fallen, atol=1e-4)
+
+
 def test_a_tenth_of_a_cartesian_command_is_done(make_env):
     env = make_env(paper_env, seed=0)
     env.reset()
@@ -94,6 +104,30 @@ def test_tool_pose_lags_one_substep(make_env):
     fresh = np.array(env._worlds[0].read(fresh=True))[16:19]
     step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0]]))
     np.testing.assert_allclose(env.arm_state.ee_position[0], fresh, atol=1e-6)
+
+
+def test_gap_with_a_contact_point_costs(make_env):
+    """Bullet reports contact points from 2 cm before a touch: so the original counts."""
+    assert make_env(paper_env).costs == {"collision": Collision(margin=0.02)}
+
+
+def test_fourth_component_is_the_fingers_position(make_env):
+    env = make_env(paper_env, seed=0)
+    env.reset()
+    for _ in range(100):
+        step(env, torch.tensor([[0, 0, 0, 0.03]]))
+    np.testing.assert_allclose(env.arm_state.finger_position, [[0.03, 0.03]], atol=2e-3)
+
+
+def test_arguments_go_before_the_papers(make_env):
+    env = make_env(paper_env, max_episode_steps=3, frame_skip=2)
+    assert (env.max_episode_steps, env.control_rate) == (3, 120)
+
+
+def test_obstacle_weighs_a_kilogram(make_env):
+    world = make_env(paper_env)._worlds[0]
+    body = pybullet.getDynamicsInfo(world._obstacles[0], -1, physicsClientId=world._client)
+    assert body[0] == 1
 
 
 def test_reward_is_the_l1_distance(make_env):

@@ -18,6 +18,31 @@ def test_fingers_are_fixed_and_visuals_dropped():
     assert len([*root.iter("collision")]) == 11
 
 
+def test_every_joint_beyond_the_tool_is_fixed():
+    """Also one that turns."""
+    text, chain = prepare_urdf(PANDA_URDF, "panda_link5", visuals=False, fix_fingers=True)
+    joints = ElementTree.fromstring(text).findall("joint")
+    movable = {j.get("name") for j in joints if j.get("type") != "fixed"}
+    assert movable == chain == {f"panda_joint{i}" for i in range(1, 6)}
+
+
+def test_meshes_of_a_package_are_found_and_all_visuals_dropped(tmp_path):
+    """As in ROS: the URDF and the meshes in different folders of the package."""
+    mesh = tmp_path / "robot" / "meshes" / "tool.obj"
+    path = tmp_path / "robot" / "urdf" / "arm.urdf"
+    for file in (mesh, path):
+        file.parent.mkdir(parents=True)
+    mesh.write_text("")
+    visual = "<visual><geometry><sphere radius='1'/></geometry></visual>"
+    path.write_text(
+        f'<robot name="r"><link name="tool">{visual}{visual}<collision><geometry>'
+        '<mesh filename="package://robot/meshes/tool.obj"/></geometry></collision></link></robot>'
+    )
+    root = ElementTree.fromstring(prepare_urdf(path, "tool", visuals=False, fix_fingers=True)[0])
+    assert [found.get("filename") for found in root.iter("mesh")] == [str(mesh)]
+    assert not [*root.iter("visual")]
+
+
 def test_everything_else_stays():
     text, _ = prepare_urdf(PANDA_URDF, "panda_hand", visuals=True, fix_fingers=False)
     root = ElementTree.fromstring(text)

@@ -180,9 +180,6 @@ class World:
         self.joint_upper = np.where(unlimited, np.inf, [info[9] for info in joints])
         self.joint_speed = np.array([info[11] or np.inf for info in joints])
         self._efforts = [info[10] or _UNLIMITED_EFFORT for info in joints + fingers]
-        # The tool point in the frame of the link's centre of mass, where Bullet wants it.
-        _, _, com, com_orientation, *_ = self._link_state(fresh=True)
-        self._tool_in_com = pybullet.invertTransform(com, com_orientation)[0]
 
     def _add_body(
         self,
@@ -311,8 +308,9 @@ class World:
         for column, angle in zip(self._columns, joint_position, strict=True):
             position[column] = angle
         zeros = [0.0] * self._num_movable
+        # The point is given in the frame of the link, whose origin is the tool point.
         linear, angular = pybullet.calculateJacobian(
-            self._arm, self._ee, self._tool_in_com, position, zeros, zeros, self._client
+            self._arm, self._ee, (0.0, 0.0, 0.0), position, zeros, zeros, self._client
         )
         if self._num_movable == len(self._columns):
             return (*linear, *angular)
