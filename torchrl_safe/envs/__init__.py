@@ -2,7 +2,7 @@
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
-from torchrl_safe.envs.arms import PANDA, ArmModel
+from torchrl_safe.envs.arms import PANDA, ArmModel, Gripper
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.kinematics import (
@@ -13,6 +13,7 @@ from torchrl_safe.envs.kinematics import (
 from torchrl_safe.envs.observations import full_observation, paper_observation
 from torchrl_safe.envs.obstacles import Cylinder, InFront, NoObstacles, Obstacles
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, paper_env
+from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.state import ArmState
 from torchrl_safe.envs.tasks import Reach, Task
@@ -31,12 +32,14 @@ __all__ = [
     "Collision",
     "Cylinder",
     "DampedLeastSquares",
+    "Gripper",
     "InFront",
     "InverseKinematics",
     "JointDelta",
     "NoObstacles",
     "Obstacles",
     "Reach",
+    "Region",
     "Scene",
     "Task",
     "World",

@@ -4,6 +4,39 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torchrl_safe.envs.checks import check_array
+from torchrl_safe.envs.regions import Region
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """A gripper that can be mounted on any arm.
+
+    Args:
+        urdf: path of the URDF file, as that of an :class:`ArmModel`.
+        tool_link: name of the gripper's link whose frame is the tool point.
+        position: where the gripper's root link is mounted, in the frame of the arm's
+            ``ee_link``, m.
+        rotation: how it is turned there: roll, pitch and yaw, rad.
+
+    Raises:
+        ValueError: if ``position`` or ``rotation`` is not three finite numbers. A file or link
+            that does not fit raises it where the world is built.
+
+    Examples:
+        >>> Gripper("gripper.urdf", "tool", position=(0.0, 0.0, 0.045)).rotation
+        (0.0, 0.0, 0.0)
+    """
+
+    urdf: str
+    tool_link: str
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_array("position", self.position, (3,))
+        check_array("rotation", self.rotation, (3,))
+
 
 @dataclass(frozen=True)
 class ArmModel:
@@ -13,12 +46,17 @@ class ArmModel:
     (a gripper's fingers) is fixed, unless the :class:`~torchrl_safe.envs.Scene` leaves it free.
 
     Args:
-        urdf: path of the URDF file, absolute or relative to ``pybullet_data``.
-        ee_link: name of the end-effector link, whose frame is the tool point.
+        urdf: path of the URDF file, absolute or relative to ``pybullet_data`` or to the robots
+            of ``example-robot-data`` (the ``more-arms`` extra).
+        ee_link: name of the end-effector link. Its frame is the tool point, unless a gripper
+            is mounted on it.
         home: joint angles at the start of an episode, in radians, one for each joint of the
             arm. Cartesian actions keep the tool orientation of this pose.
+        goals: where goals can be reached with the tool held as at home, in the frame of the
+            arm's base, m.
         finger_home: position of the joints that are not part of the arm, in metres, where they
             are free.
+        gripper: what is mounted on ``ee_link``; its ``tool_link`` then is the tool point.
 
     A file, link or home pose that does not fit raises ValueError where the world is built.
 
@@ -31,7 +69,9 @@ class ArmModel:
     urdf: str
     ee_link: str
     home: tuple[float, ...]
+    goals: Region = Region((0.6, -0.2, 0.05), (0.7, 0.2, 0.15))
     finger_home: float = 0.0
+    gripper: Gripper | None = None
 
 
 #: Franka Emika Panda with its hand closed; at home the tool points down at (0.35, 0, 0.2) m.

@@ -132,9 +132,8 @@ class World:
             pybullet.loadURDF(str(data / "plane.urdf"), (0, 0, -0.7), physicsClientId=client)
 
     def _load_arm(self, arm: ArmModel) -> None:
-        path = Path(pybullet_data.getDataPath()) / arm.urdf
-        text, chain = prepare_urdf(
-            path, arm.ee_link, visuals=self._visuals, fix_fingers=not self._scene.free_fingers
+        text, chain, tool_link = prepare_urdf(
+            arm, visuals=self._visuals, fix_fingers=not self._scene.free_fingers
         )
         client = self._client
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE if self._scene.urdf_inertia else 0
@@ -147,7 +146,7 @@ class World:
                 )
             except pybullet.error as error:
                 raise ValueError(f"urdf {arm.urdf!r} does not load in PyBullet.") from error
-        self._find_joints(chain, arm.ee_link)
+        self._find_joints(chain, tool_link)
         if len(arm.home) != len(self._joints):
             raise ValueError(
                 f"home must give {len(self._joints)} joint angles, one for each movable joint up "

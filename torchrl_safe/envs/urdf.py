@@ -2,10 +2,76 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
+
+import pybullet_data
+
+from torchrl_safe.envs.arms import ArmModel, Gripper
 
 _PACKAGE = "package://"
+# What the names of an attached gripper begin with, so that they are not those of the arm.
+_PREFIX = "gripper/"
+_MORE_ARMS = "example-robot-data"
+
+
+class PreparedUrdf(NamedTuple):
+    """A URDF ready to be loaded."""
+
+    #: The XML, with absolute mesh paths.
+    text: str
+    #: Names of the joints that move the tool.
+    joints: set[str]
+    #: Name of the link whose frame is the tool point.
+    tool_link: str
+
+
+def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool) -> PreparedUrdf:
+    """Returns the URDF of an arm with its gripper.
+
+    Args:
+        arm: the arm.
+        visuals: keep the visual shapes, which cost memory and load time.
+        fix_fingers: fix every joint that does not move the tool: a Panda's two fingers are
+            half of the cost of a physics step.
+
+    Raises:
+        ValueError: if a file is missing or not XML, a mesh is missing or there is no such link.
+    """
+    root = _read(arm.urdf, visuals=visuals)
+    chain = movable_chain(root, arm.ee_link)
+    tool_link = arm.ee_link
+    if arm.gripper is not None:
+        tool_link = _attach(root, arm.ee_link, arm.gripper, visuals=visuals)
+        chain = movable_chain(root, tool_link)
+    if fix_fingers:
+        for joint in root.findall("joint"):
+            if joint.get("name") not in chain:
+                joint.set("type", "fixed")
+    return PreparedUrdf(ElementTree.tostring(root, encoding="unicode"), chain, tool_link)
+
+
+def find_urdf(name: str) -> Path:
+    """Returns the path of a URDF file.
+
+    Args:
+        name: path, absolute or relative to the folder of ``pybullet_data``, of the robots of
+            example-robot-data where that is installed, or of this package.
+
+    Raises:
+        ValueError: if there is no such file.
+    """
+    for folder in _folders():
+        # An absolute name takes the place of the folder.
+        if (folder / name).is_file():
+            return folder / name
+    hint = "there is no such file, neither as an absolute path nor in pybullet_data"
+    if name.partition("/")[0].endswith("_description"):
+        hint += f'; the arms of {_MORE_ARMS} need `pip install "torchrl-safe[more-arms]"`'
+    raise ValueError(f"urdf must be a readable URDF file, got {name!r}: {hint}.")
 
 
 def movable_chain(root: ElementTree.Element, tip: str) -> set[str]:
@@ -14,38 +80,31 @@ def movable_chain(root: ElementTree.Element, tip: str) -> set[str]:
     Raises:
         ValueError: if the URDF has no link of that name.
     """
-    links = [link.get("name", "") for link in root.findall("link")]
-    if tip not in links:
-        raise ValueError(f"ee_link must be a link of the URDF ({', '.join(links)}), got {tip!r}.")
-    parents = {
-        joint.find("child").get("link"): joint  # type: ignore[union-attr]
-        for joint in root.findall("joint")
-    }
+    _check_link("ee_link", root, tip)
+    parents = {_end(joint, "child"): joint for joint in root.findall("joint")}
     chain = set()
-    link: str | None = tip
+    link = tip
     while link in parents:
         joint = parents[link]
         if joint.get("type") != "fixed":
             chain.add(joint.get("name", ""))
-        link = joint.find("parent").get("link")  # type: ignore[union-attr]
+        link = _end(joint, "parent")
     return chain
 
 
-def prepare_urdf(
-    path: Path, ee_link: str, *, visuals: bool, fix_fingers: bool
-) -> tuple[str, set[str]]:
-    """Returns the text of a URDF with absolute mesh paths, and its arm's joint names.
+def _folders() -> Iterator[Path]:
+    yield Path(pybullet_data.getDataPath())
+    try:
+        package = importlib.metadata.distribution(_MORE_ARMS)
+    except importlib.metadata.PackageNotFoundError:
+        pass
+    else:
+        yield Path(str(package.locate_file(f"cmeel.prefix/share/{_MORE_ARMS}/robots")))
+    yield Path(__file__).parent
 
-    Args:
-        path: the URDF file.
-        ee_link: name of the end-effector link.
-        visuals: keep the visual shapes, which cost memory and load time.
-        fix_fingers: fix every joint that does not move ``ee_link``: a Panda's two fingers are
-            half of the cost of a physics step.
 
-    Raises:
-        ValueError: if the file is not XML, a mesh is missing or there is no such link.
-    """
+def _read(name: str, *, visuals: bool) -> ElementTree.Element:
+    path = find_urdf(name)
     try:
         root = ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError) as error:
@@ -56,14 +115,46 @@ def prepare_urdf(
         for link in root.iter("link"):
             for visual in link.findall("visual"):
                 link.remove(visual)
-    chain = movable_chain(root, ee_link)
-    if fix_fingers:
-        for joint in root.findall("joint"):
-            if joint.get("name") not in chain:
-                joint.set("type", "fixed")
     for mesh in root.iter("mesh"):
         mesh.set("filename", str(_find_mesh(path, mesh.get("filename", ""))))
-    return ElementTree.tostring(root, encoding="unicode"), chain
+    return root
+
+
+def _attach(arm: ElementTree.Element, ee_link: str, gripper: Gripper, *, visuals: bool) -> str:
+    """Adds a gripper to the URDF of an arm; returns the name that its tool link has there."""
+    root = _read(gripper.urdf, visuals=visuals)
+    _check_link("tool_link", root, gripper.tool_link)
+    children = {_end(joint, "child") for joint in root.findall("joint")}
+    palm = next(name for name in _link_names(root) if name not in children)
+    for element in root.iter():
+        for key in ("name", "link", "joint"):
+            if key in element.attrib:
+                element.set(key, _PREFIX + element.attrib[key])
+    mount = ElementTree.SubElement(arm, "joint", name=f"{_PREFIX}mount", type="fixed")
+    ElementTree.SubElement(mount, "parent", link=ee_link)
+    ElementTree.SubElement(mount, "child", link=_PREFIX + palm)
+    xyz, rpy = (" ".join(map(str, values)) for values in (gripper.position, gripper.rotation))
+    ElementTree.SubElement(mount, "origin", xyz=xyz, rpy=rpy)
+    arm.extend(root)
+    return _PREFIX + gripper.tool_link
+
+
+def _check_link(argument: str, root: ElementTree.Element, name: str) -> None:
+    links = _link_names(root)
+    if name not in links:
+        raise ValueError(
+            f"{argument} must be a link of the URDF ({', '.join(links)}), got {name!r}."
+        )
+
+
+def _link_names(root: ElementTree.Element) -> list[str]:
+    return [link.get("name", "") for link in root.findall("link")]
+
+
+def _end(joint: ElementTree.Element, side: str) -> str:
+    """Name of the parent or child link of a joint."""
+    link = joint.find(side)
+    return "" if link is None else link.get("link", "")
 
 
 def _find_mesh(urdf: Path, name: str) -> Path:
