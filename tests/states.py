@@ -3,6 +3,7 @@
 import numpy as np
 
 from torchrl_safe.envs import ArmState
+from torchrl_safe.envs.state import Trace
 
 
 def make_state(**changes):
@@ -17,9 +18,28 @@ def make_state(**changes):
         "ee_orientation": np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)),
         "ee_velocity": np.zeros((2, 3)),
         "goal": np.ones((2, 3)),
-        "obstacle_position": np.zeros((2, 1, 3)),
-        "obstacle_velocity": np.zeros((2, 1, 3)),
+        **bodies("object", 1),
+        **bodies("obstacle", 1),
+        "obstacle_present": np.ones((2, 1), bool),
         "obstacle_size": np.ones((1, 3)),
         "contact_distance": np.full((2, 1), np.inf),
+        "contact_force": np.zeros((2, 1)),
+        "trace": Trace(),
     }
-    return ArmState(**{**fields, **{k: np.asarray(v, float) for k, v in changes.items()}})
+    arrays = {k: v if k == "trace" else np.asarray(v) for k, v in changes.items()}
+    return ArmState(**{**fields, **arrays})
+
+
+def make_trace(**measurements):
+    """What a state records of each substep."""
+    return Trace({name: np.asarray(values, float) for name, values in measurements.items()})
+
+
+def bodies(kind, count):
+    """Bodies of two worlds that stand at the origin."""
+    return {
+        f"{kind}_position": np.zeros((2, count, 3)),
+        f"{kind}_orientation": np.tile([0.0, 0.0, 0.0, 1.0], (2, count, 1)),
+        f"{kind}_velocity": np.zeros((2, count, 3)),
+        f"{kind}_angular_velocity": np.zeros((2, count, 3)),
+    }

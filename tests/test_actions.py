@@ -12,16 +12,22 @@ from tensordict import TensorDict
 from torchrl_safe.envs import (
     PANDA,
     ArmEnv,
+    ArmModel,
     BulletInverseKinematics,
     CartesianDelta,
     DampedLeastSquares,
     JointDelta,
     NoObstacles,
     Reach,
+    Region,
     Scene,
 )
+from torchrl_safe.envs.batch import split
 from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.kinematics import rotation_vector
+from torchrl_safe.envs.rotations import rotation_vector
+
+# An arm without a gripper.
+BARE = ArmModel("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", (0, 0.4, 0, -2, 0, 0.74, 0))
 
 
 def drive(env, goal, steps):
@@ -50,11 +56,8 @@ def test_tool_reaches_targets_to_a_millimetre(make_env, solver):
 
 def state_of(world):
     """What DampedLeastSquares reads, of one world whose joints were set by hand."""
-    row = np.array(world.read(fresh=True))
-    widths = world.widths()
-    parts = dict(zip(widths, np.split(row, np.cumsum([*widths.values()])[:-1]), strict=True))
     return SimpleNamespace(
-        **{name: part[None] for name, part in parts.items()},
+        **split(np.array([world.read(fresh=True)]), world.read_shapes()),
         joint_lower=world.joint_lower,
         joint_upper=world.joint_upper,
     )
@@ -72,7 +75,7 @@ def test_one_step_of_least_squares_lands_near_the_target():
             state = state_of(world)
             target = state.ee_position + rng.uniform(-0.03, 0.03, 3)
             # The wanted orientation is the present one, so that only the position moves.
-            angles = DampedLeastSquares()(target, state.ee_orientation[0], state, [world])
+            angles = DampedLeastSquares()(target, state.ee_orientation, state, [world])
             check._set_joints(angles[0])
             errors.append(np.linalg.norm(state_of(check).ee_position - target))
         assert np.median(errors) < 0.004
@@ -90,11 +93,11 @@ def test_damping_and_limits_hold_the_joints_back_near_a_singular_pose():
         target = state.ee_position + np.array([[0.0, 0.0, 0.05]])
         unbounded = np.full(7, np.inf)
         state.joint_lower, state.joint_upper = -unbounded, unbounded
-        angles = DampedLeastSquares()(target, state.ee_orientation[0], state, [world])
+        angles = DampedLeastSquares()(target, state.ee_orientation, state, [world])
         assert np.abs(angles - state.joint_position).max() < 0.5
         # The limits hold whatever the step would be.
         state.joint_lower, state.joint_upper = state.joint_position[0] + [[-0.01], [0.01]]
-        held = DampedLeastSquares()(target, state.ee_orientation[0], state, [world])
+        held = DampedLeastSquares()(target, state.ee_orientation, state, [world])
         np.testing.assert_array_equal(held, np.clip(angles, state.joint_lower, state.joint_upper))
     finally:
         world.close()
@@ -135,7 +138,7 @@ def test_full_action_keeps_joint_limits(make_env, action):
 @pytest.mark.parametrize("action", [CartesianDelta(), JointDelta()], ids=lambda a: type(a).__name__)
 def test_joints_keep_to_the_speeds_of_the_urdf(make_env, action):
     """Within what the efforts allow: full reversals shake the wrist's 12 N m joints beyond it."""
-    task = Reach(low=(0.7, 0, 0.5), high=(0.7, 0, 0.5), radius=0.001)
+    task = Reach(Region((0.7, 0, 0.5), (0.7, 0, 0.5)), radius=0.001)
     env = make_env(ArmEnv, num_envs=8, action=action, task=task, obstacles=NoObstacles(), seed=0)
     generator = torch.manual_seed(0)
     limit = env._worlds[0].joint_speed
@@ -233,7 +236,13 @@ def test_rotation_vector_takes_the_short_way():
         (lambda: DampedLeastSquares(damping=0), "damping must be positive and finite, got 0"),
         (lambda: Scene(gravity=float("nan")), "gravity must be finite"),
         (lambda: Scene(motor_gain=0), "motor_gain must be positive and finite, got 0"),
-        (lambda: ArmEnv(action=CartesianDelta(finger_step=1)), "finger_step moves free fingers"),
+        (lambda: CartesianDelta(yaw_step=-1), "yaw_step must be positive and finite, got -1"),
+        (lambda: CartesianDelta(yaw_step=1, rotation_step=1), "give one of them, got 1 and 1"),
+        (lambda: JointDelta(finger_step=0), "finger_step must be positive and finite, got 0"),
+        (
+            lambda: ArmEnv(BARE, action=CartesianDelta(finger_step=1)),
+            "finger_step moves fingers, got 1 and an arm that has none",
+        ),
     ],
 )
 def test_bad_arguments(make, message):

@@ -23,7 +23,9 @@ from torchrl_safe.envs import (
     InFront,
     JointDelta,
     NoObstacles,
+    Placement,
     Reach,
+    Region,
     Scene,
 )
 
@@ -56,7 +58,7 @@ class Places:
         self.places, self.shapes = np.array(places), shapes
 
     def sample(self, rng, start, goal):
-        return self.places
+        return Placement(self.places)
 
 
 @pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
@@ -242,7 +244,7 @@ def test_time_limit_truncates(make_env):
 def test_success_at_the_time_limit_is_no_truncation(make_env):
     """Else a critic would bootstrap from a state in which the task is done."""
     home = (0.35, 0, 0.2)
-    task = Reach(low=home, high=home)
+    task = Reach(Region(home, home))
     env = make_env(ArmEnv, task=task, obstacles=NoObstacles(), max_episode_steps=1)
     assert not env.reset()["success"], "not before the first step"
     result = step(env, torch.zeros(1, 3))
@@ -280,8 +282,11 @@ def test_terminal_observation_is_true(make_env):
 
 def test_touch_in_the_middle_of_a_control_step_counts(make_env):
     """Each substep is read: a touch that is over at the end of the control step still costs."""
-    settings = {"frame_skip": 12, "scene": Scene(motor_gain=0.1), "seed": 0}
-    coarse, fine = make_env(ArmEnv, **settings), make_env(ArmEnv, **settings)
+    settings = {"scene": Scene(motor_gain=0.1), "seed": 0}
+    coarse = make_env(ArmEnv, **settings)
+    # Of the same control rate, as far as the speed of the joints goes.
+    fine = make_env(ArmEnv, frame_skip=1, **settings)
+    fine.frame_skip = 12
     coarse.reset()
     fine.reset()
     lost, cost = 0, 0
@@ -291,11 +296,13 @@ def test_touch_in_the_middle_of_a_control_step_counts(make_env):
         action = towards(coarse, aim)
         cost = step(coarse, action)["cost"].item()
         # The same motion by hand, one substep at a time.
-        joints, _ = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._worlds)
-        joints = fine._within_speed(joints)
-        touches = [fine._worlds[0].advance(joints[0].tolist(), [], 1)[0] <= 0 for _ in range(12)]
-        fine._rows = [fine._worlds[0].read()]
-        fine._state = fine._make_state()
+        joints, fingers = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._worlds)
+        joints, fingers = fine._within_speed(joints, fingers)
+        touches = []
+        for _ in range(12):
+            fine._batch.advance(joints, fingers)
+            touches.append(fine._batch.state().contact_distance.item() <= 0)
+        fine._state = fine._batch.state()
         assert cost == float(any(touches)), index
         lost += any(touches) and not touches[-1]
     assert lost > 0
@@ -367,8 +374,9 @@ class Task(Reach):
         super().__init__()
         self.__dict__["values"] = values
 
-    def sample_goal(self, rng):
-        return self.values.get("goal", super().sample_goal(rng))
+    def sample(self, rng, goals):
+        goal, objects = super().sample(rng, goals)
+        return self.values.get("goal", goal), objects
 
     def reward(self, state):
         return self.values.get("reward", super().reward(state))
@@ -395,7 +403,7 @@ class Task(Reach):
         ({"observation": lambda s: {"x": s.goal[0]}}, r"observation field 'x' must have shape"),
         ({"observation": lambda s: {"x": s.contact_distance}}, "observation field 'x' must be fin"),
         ({"obstacles": Places([0.7, 0, 0])}, r"obstacle positions must have shape \(2, 3\), got"),
-        ({"obstacles": Places([0.7, 0, 0], [np.nan] * 3)}, "obstacle positions must be finite"),
+        ({"obstacles": Places([0.7, 0, 0], [np.nan] * 3)}, "position must be finite"),
         ({"obstacles": InFront(gap=0.2)}, "obstacles must leave the arm free at home"),
         ({"obstacles": InFront(gap=0.5)}, "gap must be less than the horizontal distance"),
     ],

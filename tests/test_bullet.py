@@ -10,7 +10,17 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_safe.envs import PANDA, ArmEnv, ArmModel, Cylinder, InFront, JointDelta, NoObstacles
+from torchrl_safe.envs import (
+    PANDA,
+    ArmEnv,
+    ArmModel,
+    Cylinder,
+    InFront,
+    JointDelta,
+    NoObstacles,
+    Placement,
+    Region,
+)
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.scene import Scene
 
@@ -133,7 +143,9 @@ LEVER = """<robot name="lever">
 def lever(tmp_path):
     path = tmp_path / "lever.urdf"
     path.write_text(LEVER)
-    return ArmModel(str(path), "tip", home=(0.2, 0.4))
+    return ArmModel(
+        str(path), "tip", home=(0.2, 0.4), goals=Region((0.4, 0.3, 0.3), (0.4, 0.3, 0.3))
+    )
 
 
 def test_tool_point_is_the_origin_of_the_link(make_env, lever):
@@ -179,7 +191,7 @@ def test_joints_without_limits(lever):
 def test_inertia_is_that_of_the_urdf_if_wanted(lever, from_urdf):
     world = World(lever, Scene(urdf_inertia=from_urdf), ())
     try:
-        inertia = pybullet.getDynamicsInfo(world._arm, 1, physicsClientId=world._client)[2]
+        inertia = pybullet.getDynamicsInfo(world._arm.body, 1, physicsClientId=world._client)[2]
         assert (inertia == (1, 2, 3)) == from_urdf
     finally:
         world.close()
@@ -205,6 +217,7 @@ def test_picture_world_takes_joints_and_poses():
     one, two = (World(PANDA, Scene(), (Cylinder(mass=1.0),)) for _ in range(2))
     try:
         lying = ((0.6, 0.1, 0.05), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
+        one.reset(Placement([[0.5, 0, 0.1]]), np.zeros(3), np.zeros((0, 3)))
         one._set_joints(np.array(PANDA.home) + 0.1)
         one._place(one._obstacles[0], *lying)
         two.copy_from(one)

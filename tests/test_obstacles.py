@@ -8,25 +8,27 @@ RNG = np.random.default_rng(0)
 
 def test_in_front_stands_on_the_way():
     start, goal = np.array([0.3, 0.1, 0.5]), np.array([0.6, 0.5, 0.2])
-    (centre,) = InFront(gap=0.25, shape=Cylinder(height=0.3)).sample(RNG, start, goal)
+    (centre,) = InFront(gap=0.25, shape=Cylinder(height=0.3)).sample(RNG, start, goal).position
     # The way is (0.3, 0.4) long 0.5: half of it before the goal, on the table.
     np.testing.assert_allclose(centre, [0.45, 0.3, 0.15])
 
 
 def test_in_front_of_the_paper():
     layout = InFront(gap=0.2, direction=(1, 0, 0), height=0.05)
-    (centre,) = layout.sample(RNG, np.zeros(3), np.array([0.7, 0.1, 0.05]))
+    (centre,) = layout.sample(RNG, np.zeros(3), np.array([0.7, 0.1, 0.05])).position
     np.testing.assert_allclose(centre, [0.5, 0.1, 0.05])
 
 
 def test_direction_has_no_length():
     """It only points; and as it does not depend on the start, neither does the room for it."""
     layout = InFront(gap=0.2, direction=(0, 5, 0), shape=Cylinder(height=0.3))
-    (centre,) = layout.sample(RNG, np.array([0.7, 0, 0.5]), np.array([0.7, 0.1, 0.05]))
+    (centre,) = layout.sample(RNG, np.array([0.7, 0, 0.5]), np.array([0.7, 0.1, 0.05])).position
     np.testing.assert_allclose(centre, [0.7, -0.1, 0.15], atol=1e-12)
     slow = InFront(gap=0.2, direction=(0, 0.1, 0), shape=Cylinder(height=0.3))
     np.testing.assert_allclose(
-        slow.sample(RNG, np.zeros(3), np.array([0.7, 0.1, 0.05])), [[0.7, -0.1, 0.15]], atol=1e-12
+        slow.sample(RNG, np.zeros(3), np.array([0.7, 0.1, 0.05])).position,
+        [[0.7, -0.1, 0.15]],
+        atol=1e-12,
     )
 
 
@@ -43,7 +45,7 @@ def test_in_front_needs_room():
 
 def test_no_obstacles():
     assert NoObstacles().shapes == ()
-    assert NoObstacles().sample(RNG, np.zeros(3), np.ones(3)).shape == (0, 3)
+    assert NoObstacles().sample(RNG, np.zeros(3), np.ones(3)).position.shape == (0, 3)
 
 
 @pytest.mark.parametrize(

@@ -4,19 +4,30 @@ from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
 from torchrl_safe.envs.arms import PANDA, ArmModel, Gripper
 from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.costs import Collision
+from torchrl_safe.envs.costs import (
+    Collision,
+    ContactForce,
+    JointLimit,
+    Proximity,
+    Speed,
+    SpeedAndSeparation,
+    Workspace,
+)
+from torchrl_safe.envs.human import Human
 from torchrl_safe.envs.kinematics import (
     BulletInverseKinematics,
     DampedLeastSquares,
     InverseKinematics,
 )
-from torchrl_safe.envs.observations import full_observation, paper_observation
-from torchrl_safe.envs.obstacles import Cylinder, InFront, NoObstacles, Obstacles
+from torchrl_safe.envs.moving import Motion, Moving, Patrol, Swing
+from torchrl_safe.envs.observations import FullObservation, paper_observation
+from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placement, Scattered
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, paper_env
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.scene import Camera, Scene
-from torchrl_safe.envs.state import ArmState
-from torchrl_safe.envs.tasks import Reach, Task
+from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from torchrl_safe.envs.state import ArmState, Sensing, Sensor
+from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
 
 __all__ = [
     "PANDA",
@@ -26,24 +37,45 @@ __all__ = [
     "ArmEnv",
     "ArmModel",
     "ArmState",
+    "Box",
     "BulletInverseKinematics",
     "Camera",
+    "Capsule",
     "CartesianDelta",
     "Collision",
+    "ContactForce",
     "Cylinder",
     "DampedLeastSquares",
+    "FullObservation",
     "Gripper",
+    "Human",
     "InFront",
     "InverseKinematics",
     "JointDelta",
+    "JointLimit",
+    "Motion",
+    "Moving",
     "NoObstacles",
     "Obstacles",
+    "Patrol",
+    "PickAndPlace",
+    "Placement",
+    "Proximity",
+    "Push",
     "Reach",
     "Region",
+    "Scattered",
     "Scene",
+    "Sensing",
+    "Sensor",
+    "Shape",
+    "Speed",
+    "SpeedAndSeparation",
+    "Sphere",
+    "Swing",
     "Task",
+    "Workspace",
     "World",
-    "full_observation",
     "paper_env",
     "paper_observation",
 ]

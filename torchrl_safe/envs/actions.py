@@ -11,6 +11,7 @@ import numpy as np
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.checks import check_array, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
+from torchrl_safe.envs.rotations import from_rotation_vector, multiply
 from torchrl_safe.envs.state import ArmState, Array
 
 
@@ -21,6 +22,10 @@ class ActionMode(Protocol):
     @property
     def bound(self) -> float:
         """Largest magnitude of an action component; the environment clips to it."""
+
+    @property
+    def moves_fingers(self) -> bool:
+        """Whether actions move the fingers, which else are fixed."""
 
     def width(self, num_joints: int) -> int:
         """Returns the number of components of an action."""
@@ -35,8 +40,9 @@ class ActionMode(Protocol):
 class CartesianDelta:
     """Moves the tool point by ``step`` metres times the action (the paper's AR1).
 
-    The three components are displacements along x, y and z; the orientation of the tool stays
-    that of the home pose (pointing down).
+    The first three components are displacements along x, y and z. The tool keeps the
+    orientation of the home pose (pointing down) unless it is turned; then follow the components
+    that turn it, and last the one that moves the fingers.
 
     Args:
         step: displacement that an action of 1 asks for, m.
@@ -44,22 +50,30 @@ class CartesianDelta:
         inverse_kinematics: turns tool poses into joint angles.
         orientation: tool orientation to keep, a quaternion (x, y, z, w). ``None`` keeps that of
             the home pose.
-        finger_step: if given, a fourth component sets the free fingers' position, in metres
-            per unit of action.
+        yaw_step: if given, a component turns the tool about the vertical, in rad per unit of
+            action; it keeps pointing down.
+        rotation_step: if given, three components turn the tool about x, y and z, in rad per
+            unit of action, from where it points; it keeps no orientation.
+        finger_step: if given, the last component sets the free fingers' position, in metres
+            per unit of action: 1 opens them so far, 0 and less closes them.
 
     Raises:
-        ValueError: if ``step``, ``bound`` or ``finger_step`` is not positive, or
-            ``orientation`` is not a unit quaternion.
+        ValueError: if ``bound`` or a step is not positive, ``orientation`` is not a unit
+            quaternion, or both yaw and rotation are given.
 
     Examples:
         >>> CartesianDelta(step=0.03).width(num_joints=7)
         3
+        >>> CartesianDelta(yaw_step=0.2, finger_step=0.04).width(num_joints=7)
+        5
     """
 
     step: float = 0.05
     bound: float = 1.0
     inverse_kinematics: InverseKinematics = DampedLeastSquares()
     orientation: tuple[float, float, float, float] | None = None
+    yaw_step: float | None = None
+    rotation_step: float | None = None
     finger_step: float | None = None
 
     def __post_init__(self) -> None:
@@ -71,40 +85,64 @@ class CartesianDelta:
                 raise ValueError(
                     f"orientation must be a unit quaternion (x, y, z, w), got {self.orientation}."
                 )
-        if self.finger_step is not None:
-            check_positive(finger_step=self.finger_step)
+        for name in ("yaw_step", "rotation_step", "finger_step"):
+            if getattr(self, name) is not None:
+                check_positive(**{name: getattr(self, name)})
+        if self.yaw_step is not None and self.rotation_step is not None:
+            raise ValueError(
+                f"yaw_step is a part of rotation_step: give one of them, got {self.yaw_step} and "
+                f"{self.rotation_step}."
+            )
+
+    @property
+    def moves_fingers(self) -> bool:
+        return self.finger_step is not None
 
     def width(self, num_joints: int) -> int:
-        return 3 if self.finger_step is None else 4
+        turns = 3 if self.rotation_step is not None else int(self.yaw_step is not None)
+        return 3 + turns + self.moves_fingers
 
     def targets(
         self, action: Array, state: ArmState, worlds: Sequence[World]
     ) -> tuple[Array, Array]:
         position = state.ee_position + self.step * action[:, :3]
-        orientation = self.orientation or worlds[0].home_orientation
-        joints = self.inverse_kinematics(position, np.asarray(orientation), state, worlds)
-        if self.finger_step is None:
-            return joints, np.zeros((len(action), 0))
-        fingers = state.finger_position.shape[1]
-        if not fingers:
-            raise ValueError(
-                f"finger_step moves free fingers, got {self.finger_step} and a Scene without "
-                "free_fingers."
-            )
-        return joints, np.repeat(self.finger_step * action[:, 3:], fingers, axis=1)
+        kept = np.asarray(self.orientation or worlds[0].home_orientation)
+        joints = self.inverse_kinematics(
+            position, self._orientation(action, state, kept), state, worlds
+        )
+        return joints, _finger_targets(action, state, self.finger_step)
+
+    def _orientation(self, action: Array, state: ArmState, kept: Array) -> Array:
+        if self.rotation_step is not None:
+            turn = from_rotation_vector(self.rotation_step * action[:, 3:6])
+            return multiply(turn, state.ee_orientation)
+        orientation = np.broadcast_to(kept, state.ee_orientation.shape)
+        if self.yaw_step is None:
+            return orientation
+        # How far the tool has turned about the vertical: the twist of its rotation from the
+        # kept orientation. Whatever else it has turned by is to be undone.
+        twist = multiply(state.ee_orientation, kept * (-1, -1, -1, 1)) * (0, 0, 1, 1)
+        twist /= np.linalg.norm(twist, axis=1, keepdims=True)
+        turn = np.zeros((len(action), 3))
+        turn[:, 2] = self.yaw_step * action[:, 3]
+        return multiply(multiply(from_rotation_vector(turn), twist), orientation)
 
 
 @dataclass(frozen=True)
 class JointDelta:
     """Turns each joint by ``step`` radians times the action (the paper's AR2).
 
+    With a step of speed / control rate, actions are joint velocities in units of that speed.
+
     Args:
         step: rotation that an action of 1 asks for, rad.
         bound: largest magnitude of a component; infinity leaves actions unclipped.
         respect_limits: never ask for an angle beyond the joint limits.
+        finger_step: if given, a last component sets the free fingers' position, in metres per
+            unit of action: 1 opens them so far, 0 and less closes them.
 
     Raises:
-        ValueError: if ``step`` or ``bound`` is not positive.
+        ValueError: if ``step``, ``bound`` or ``finger_step`` is not positive.
 
     Examples:
         >>> JointDelta().width(num_joints=7)
@@ -114,21 +152,38 @@ class JointDelta:
     step: float = 0.1
     bound: float = 1.0
     respect_limits: bool = True
+    finger_step: float | None = None
 
     def __post_init__(self) -> None:
         check_positive(step=self.step)
         _check_bound(self.bound)
+        if self.finger_step is not None:
+            check_positive(finger_step=self.finger_step)
+
+    @property
+    def moves_fingers(self) -> bool:
+        return self.finger_step is not None
 
     def width(self, num_joints: int) -> int:
-        return num_joints
+        return num_joints + self.moves_fingers
 
     def targets(
         self, action: Array, state: ArmState, worlds: Sequence[World]
     ) -> tuple[Array, Array]:
-        joints = state.joint_position + self.step * action
+        joints = state.joint_position
+        joints = joints + self.step * action[:, : joints.shape[1]]
         if self.respect_limits:
             joints = np.clip(joints, state.joint_lower, state.joint_upper)
-        return joints, np.zeros((len(action), 0))
+        return joints, _finger_targets(action, state, self.finger_step)
+
+
+def _finger_targets(action: Array, state: ArmState, step: float | None) -> Array:
+    if step is None:
+        return np.zeros((len(action), 0))
+    fingers = state.finger_position.shape[1]
+    if not fingers:
+        raise ValueError(f"finger_step moves fingers, got {step} and an arm that has none.")
+    return np.repeat(step * action[:, -1:], fingers, axis=1)
 
 
 def _check_bound(bound: float) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from dataclasses import replace
+from functools import partial, reduce
+from operator import or_
 from typing import Any
 
 import numpy as np
@@ -16,16 +18,22 @@ from torchrl.envs import EnvBase
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta
 from torchrl_safe.envs.arms import PANDA, ArmModel
+from torchrl_safe.envs.batch import WorldBatch
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.checks import check_array, check_count, check_kind
 from torchrl_safe.envs.costs import Collision
-from torchrl_safe.envs.observations import full_observation
-from torchrl_safe.envs.obstacles import InFront, Obstacles
+from torchrl_safe.envs.kinematics import distance_to_reach
+from torchrl_safe.envs.observations import FullObservation
+from torchrl_safe.envs.obstacles import InFront, Obstacles, Placement
 from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
-from torchrl_safe.envs.state import ArmState, Array
+from torchrl_safe.envs.state import ArmState, Array, Sensing, Sensor
 from torchrl_safe.envs.tasks import Reach, Task
 
 Cost = Callable[[ArmState], Array]
+
+# Episodes that are tried when an environment is made; how near, in m, counts as reached there;
+# and how often obstacles are drawn until they leave the arm free.
+_CHECKED_STARTS, _REACHED, _ATTEMPTS = 100, 0.02, 100
 
 
 class ArmEnv(EnvBase):
@@ -53,7 +61,7 @@ class ArmEnv(EnvBase):
             :class:`~torchrl_safe.envs.ArmState` to an array of shape ``(N,)``. They are read
             over all physics substeps. Defaults to ``{"collision": Collision()}``.
         observation (Callable, optional): maps the state to named fields, which are
-            concatenated. Defaults to :func:`~torchrl_safe.envs.full_observation`.
+            concatenated. Defaults to :class:`~torchrl_safe.envs.FullObservation`.
         frame_skip (int, optional): physics substeps of 1/240 s for each action. Defaults to
             ``12``: a control rate of 20 Hz.
         max_episode_steps (int, optional): time limit; sets ``truncated``. Defaults to ``40``,
@@ -94,7 +102,7 @@ class ArmEnv(EnvBase):
         task: Task = Reach(),
         obstacles: Obstacles = InFront(),
         costs: Mapping[str, Cost] | None = None,
-        observation: Callable[[ArmState], dict[str, Array]] = full_observation,
+        observation: Callable[[ArmState], dict[str, Array]] = FullObservation(),
         frame_skip: int = 12,
         max_episode_steps: int = 40,
         scene: Scene = Scene(),
@@ -124,24 +132,31 @@ class ArmEnv(EnvBase):
         self.frame_skip = frame_skip
         self.max_episode_steps = max_episode_steps
         self._observation = observation
-        self._scene = scene
-        self._picture_world: World | None = None
-        shapes = obstacles.shapes
-        self._obstacle_size = np.array([s.half_extents for s in shapes]).reshape(-1, 3)
+        self._scene = replace(scene, free_fingers=True) if action.moves_fingers else scene
         self._elapsed = np.zeros(num_envs, dtype=int)
-        self._rows: list[tuple[float, ...]] = [()] * num_envs
-        self._contact_distance = np.full((num_envs, len(shapes)), np.inf)
         self.set_seed(seed)
-        self._worlds: list[World] = []
+        sensors = [cost.sensing for cost in costs.values() if isinstance(cost, Sensor)]
+        self._batch = WorldBatch(
+            num_envs,
+            arm,
+            self._scene,
+            obstacles.shapes,
+            task.objects,
+            sensing=reduce(or_, sensors, Sensing()),
+            frame_skip=frame_skip,
+            gui=gui,
+        )
         try:
-            for index in range(num_envs):
-                self._worlds.append(World(arm, scene, shapes, gui=gui and index == 0))
             self._check_starts()
             self._make_specs()
         except BaseException:
-            self._close_worlds()
+            self._batch.close()
             raise
         self.is_closed = False
+
+    @property
+    def _worlds(self) -> list[World]:
+        return self._batch.worlds
 
     @property
     def num_envs(self) -> int:
@@ -164,20 +179,27 @@ class ArmEnv(EnvBase):
         return 1 / (SUBSTEP * self.frame_skip)
 
     def _check_starts(self) -> None:
-        # Goals that leave the obstacles no room show here rather than after hours of training.
+        # Goals out of reach, or that leave the obstacles no room, show here rather than after
+        # hours of training.
         generator = np.random.default_rng(0)
-        for _ in range(100):
+        for _ in range(_CHECKED_STARTS):
+            goal, objects = self._draw_task(generator)
+            for name, points in (("goals", goal[None]), ("objects", objects)):
+                for point in points:
+                    miss = distance_to_reach(self._worlds[0], self.arm.home, point)
+                    if miss > _REACHED:
+                        raise ValueError(
+                            f"task must draw {name} that the arm can reach, got "
+                            f"{point.round(3).tolist()} from {self.task}, from which the tool "
+                            f"stays {miss:.3f} m away: give the task another region, or the "
+                            "arm other goals."
+                        )
             self._reset_world(0, generator)
-            if (clearance := self._worlds[0].clearance()) <= 0:
-                raise ValueError(
-                    f"obstacles must leave the arm free at home, got an overlap of "
-                    f"{-clearance:.4f} m from {self.obstacles}."
-                )
 
     def _make_specs(self) -> None:
         for row in range(self.num_envs):
             self._reset_world(row, np.random.default_rng(0))
-        self._state = state = self._make_state()
+        self._state = state = self._batch.state()
         # What the arguments compute is checked here once, so that it fails at the door.
         joints = state.joint_position.shape[1]
         width = self.action_mode.width(joints)
@@ -227,7 +249,7 @@ class ArmEnv(EnvBase):
         rows = range(self.num_envs) if chosen is None else chosen.flatten().nonzero().flatten()
         for row in rows:
             self._reset_world(int(row), self._generators[int(row)])
-        self._state = self._make_state()
+        self._state = self._batch.state()
         return self._pack(
             observation=self._observe(self._state),
             success=np.zeros((self.num_envs, 1), dtype=bool),
@@ -238,16 +260,10 @@ class ArmEnv(EnvBase):
         action = self._check_action(tensordict.get("action"))
         joints, fingers = self.action_mode.targets(action, self._state, self._worlds)
         if self._scene.motor_limits:
-            joints = self._within_speed(joints)
-        for row, (world, joint_target, finger_target) in enumerate(
-            zip(self._worlds, joints.tolist(), fingers.tolist(), strict=True)
-        ):
-            self._contact_distance[row] = world.advance(
-                joint_target, finger_target, self.frame_skip
-            )
-            self._rows[row] = world.read()
+            joints, fingers = self._within_speed(joints, fingers)
+        self._batch.advance(joints, fingers)
         self._elapsed += 1
-        self._state = state = self._make_state()
+        self._state = state = self._batch.state()
         reward, cost, success = self._outcome(state)
         truncated = (self._elapsed >= self.max_episode_steps)[:, None] & ~success
         return self._pack(
@@ -294,23 +310,11 @@ class ArmEnv(EnvBase):
         """
         check_count(width=width, height=height)
         self._check_open()
-        if self._picture_world is None:
-            self._picture_world = World(self.arm, self._scene, self.obstacles.shapes, visuals=True)
-        pictures = []
-        for world in self._worlds:
-            self._picture_world.copy_from(world)
-            pictures.append(self._picture_world.picture(camera, width, height))
-        return torch.from_numpy(np.stack(pictures))
+        return torch.from_numpy(self._batch.pictures(camera, width, height))
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         super().close(raise_if_closed=raise_if_closed)
-        self._close_worlds()
-
-    def _close_worlds(self) -> None:
-        for world in self._worlds:
-            world.close()
-        if self._picture_world is not None:
-            self._picture_world.close()
+        self._batch.close()
 
     def _check_open(self) -> None:
         if self.is_closed:
@@ -326,41 +330,47 @@ class ArmEnv(EnvBase):
             raise ValueError(f"action must be finite, got NaN or infinity in rows {rows}.")
         return np.clip(array, -self.action_mode.bound, self.action_mode.bound)
 
-    def _within_speed(self, joints: Array) -> Array:
+    def _within_speed(self, joints: Array, fingers: Array) -> tuple[Array, Array]:
         # All joints are slowed alike, so that the tool keeps to its path.
-        change = joints - self._state.joint_position
-        longest = self._worlds[0].joint_speed / self.control_rate
+        world, state = self._worlds[0], self._state
+        change = joints - state.joint_position
+        longest = world.joint_speed / self.control_rate
         slowdown = np.maximum(1, np.abs(change / longest).max(axis=1, keepdims=True))
-        return self._state.joint_position + change / slowdown
+        joints = state.joint_position + change / slowdown
+        if not fingers.shape[1]:
+            return joints, fingers
+        longest = world.finger_speed / self.control_rate
+        change = np.clip(fingers - state.finger_position, -longest, longest)
+        return joints, state.finger_position + change
+
+    def _draw_task(self, generator: np.random.Generator) -> tuple[Array, Array]:
+        goal, objects = self.task.sample(generator, self.arm.goals)
+        goal = check_array("goal", goal, (3,))
+        return goal, check_array("objects", objects, (len(self.task.objects), 3))
+
+    def _draw_obstacles(
+        self, generator: np.random.Generator, goal: Array, objects: Array
+    ) -> Placement:
+        start = objects[0] if len(objects) else np.array(self._worlds[0].home_position)
+        placement = self.obstacles.sample(generator, start, goal)
+        check_kind("placement", placement, Placement)
+        count = len(self.obstacles.shapes)
+        check_array("obstacle positions", placement.position, (count, 3))
+        return placement
 
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:
-        world = self._worlds[row]
-        goal = check_array("goal", self.task.sample_goal(generator), (3,))
-        start = np.array(world.home_position)
-        places = check_array(
-            "obstacle positions",
-            self.obstacles.sample(generator, start, goal),
-            self._obstacle_size.shape,
-        )
-        world.reset(places, goal)
-        self._rows[row] = world.read(fresh=True)
-        self._contact_distance[row] = np.inf
+        goal, objects = self._draw_task(generator)
+        for _ in range(_ATTEMPTS):
+            placement = self._draw_obstacles(generator, goal, objects)
+            self._batch.reset(row, placement, goal, objects)
+            if (clearance := self._worlds[row].clearance()) > 0:
+                break
+        else:
+            raise ValueError(
+                f"obstacles must leave the arm free at home, got an overlap of {-clearance:.4f} m "
+                f"from {self.obstacles}."
+            )
         self._elapsed[row] = 0
-
-    def _make_state(self) -> ArmState:
-        table = np.array(self._rows)
-        widths = self._worlds[0].widths()
-        columns = np.split(table, np.cumsum([*widths.values()])[:-1], axis=1)
-        parts = dict(zip(widths, columns, strict=True))
-        for name in ("obstacle_position", "obstacle_velocity"):
-            parts[name] = parts[name].reshape(self.num_envs, -1, 3)
-        return ArmState(
-            **parts,
-            joint_lower=self._worlds[0].joint_lower,
-            joint_upper=self._worlds[0].joint_upper,
-            obstacle_size=self._obstacle_size,
-            contact_distance=self._contact_distance.copy(),
-        )
 
     def _observe(self, state: ArmState) -> Array:
         fields = self._observation(state).values()

@@ -1,31 +1,39 @@
-"""One simulated world. The only file that talks to PyBullet."""
+"""One simulated world. With ``bodies.py`` the only file that talks to PyBullet."""
 
 from __future__ import annotations
 
-import tempfile
+import math
 import weakref
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 import pybullet
-import pybullet_data
 from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.obstacles import Cylinder
-from torchrl_safe.envs.scene import Camera, Scene
-from torchrl_safe.envs.state import Array
-from torchrl_safe.envs.urdf import prepare_urdf
+from torchrl_safe.envs.bodies import (
+    add_marker,
+    add_shape,
+    load_arm,
+    load_body,
+    load_furniture,
+)
+from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe.envs.rotations import rotation_vector
+from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
+from torchrl_safe.envs.shapes import Shape
+from torchrl_safe.envs.state import Array, Sensing
 
-_RED, _YELLOW, _WOOD = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.72, 0.58, 0.42, 1.0)
+_RED, _YELLOW, _BLUE = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.15, 0.4, 0.8, 1.0)
 _LIMBO = (0.0, 0.0, -100.0)
-_UNLIMITED_EFFORT = 1e5
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+_AT_REST = (0.0, 0.0, 0.0)
+_Vector = Sequence[float]
 
 
 class World:
-    """One arm, its table and obstacles in a PyBullet server of its own.
+    """One arm, its table, obstacles and objects in a PyBullet server of its own.
 
     Built once; :meth:`reset` restores a saved state in microseconds instead of loading files.
 
@@ -33,6 +41,8 @@ class World:
         arm: the arm.
         scene: how the world is simulated.
         shapes: the obstacles.
+        objects: what the task moves.
+        sensing: what is measured in every substep.
         visuals: load what is needed for pictures.
         gui: open PyBullet's window; one process can have one.
     """
@@ -41,8 +51,10 @@ class World:
         self,
         arm: ArmModel,
         scene: Scene,
-        shapes: Sequence[Cylinder],
+        shapes: Sequence[Shape],
+        objects: Sequence[Shape] = (),
         *,
+        sensing: Sensing = Sensing(),
         visuals: bool = False,
         gui: bool = False,
     ) -> None:
@@ -54,9 +66,9 @@ class World:
         # PyBullet reuses client numbers: each is disconnected once, by its owner.
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
         self._scene = scene
-        self._visuals = visuals or gui
+        self._sensing = sensing
         try:
-            self._build(arm, shapes)
+            self._build(arm, shapes, objects, visuals=visuals or gui)
         except BaseException:
             self.close()
             raise
@@ -73,188 +85,155 @@ class World:
             "functools.partial(ArmEnv, num_envs=8)."
         )
 
-    def clearance(self) -> float:
-        """Returns the smallest distance between arm and obstacles, up to 0.1 m."""
-        points = [
-            point[8]
-            for body in self._obstacles
-            for point in pybullet.getClosestPoints(
-                self._arm, body, 0.1, physicsClientId=self._client
-            )
-        ]
-        return min(points, default=0.1)
-
-    def _build(self, arm: ArmModel, shapes: Sequence[Cylinder]) -> None:
+    def _build(
+        self, arm: ArmModel, shapes: Sequence[Shape], objects: Sequence[Shape], *, visuals: bool
+    ) -> None:
         client, scene = self._client, self._scene
         pybullet.setGravity(0, 0, -scene.gravity, physicsClientId=client)
         # Contacts then do not depend on the order in which bodies came close.
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        self._load_furniture()
-        self._load_arm(arm)
+        self._furniture = load_furniture(client, scene, visuals=visuals)
+        self._arm = load_arm(
+            client, arm, scene, visuals=visuals, self_collision=self._sensing.itself
+        )
+        red, blue = (_RED, _BLUE) if visuals else (None, None)
         self._obstacles = [
-            self._add_body(
-                _RED,
-                pybullet.GEOM_CYLINDER,
-                mass=shape.mass,
-                radius=shape.radius,
-                height=shape.height,
-            )
-            for shape in shapes
+            add_shape(client, shape, _limbo(index), red) for index, shape in enumerate(shapes)
         ]
-        self._is_static = [shape.mass == 0 for shape in shapes]
-        self._brick = None if scene.target_urdf is None else self._load_brick(scene.target_urdf)
-        self._marker = self._load_marker() if self._visuals and self._brick is None else None
-        bodies = zip(self._obstacles, self._is_static, strict=True)
-        self._movable = [body for body, static in bodies if not static]
+        self._objects = [
+            add_shape(client, shape, _limbo(index + len(shapes)), blue)
+            for index, shape in enumerate(objects)
+        ]
+        self._is_fixed = [shape.mass == 0 for shape in shapes]
+        brick = None if scene.target_urdf is None else load_body(client, scene.target_urdf, _LIMBO)
+        self._brick = brick
+        self._marker = add_marker(client, _LIMBO, _YELLOW) if visuals and brick is None else None
+        bodies = zip(self._obstacles, self._is_fixed, strict=True)
+        self._movable = [body for body, fixed in bodies if not fixed] + self._objects
         if self._brick is not None:
             self._movable.append(self._brick)
         # Bullet restores a state bit for bit only if it was saved after a first step.
         pybullet.stepSimulation(physicsClientId=client)
-        fingers = [arm.finger_home] * len(self._fingers)
+        fingers = [arm.finger_home] * len(self._arm.fingers)
         self._set_joints([*arm.home, *fingers])
+        if self._sensing.itself:
+            self._allow_overlaps()
         self._home = pybullet.saveState(physicsClientId=client)
-        self._goal: Sequence[float] = _LIMBO
-        self._places: Sequence[Sequence[float]] = [_LIMBO] * len(shapes)
+        self._goal: _Vector = _LIMBO
+        self._present: list[int] = []
+        self._poses: list[tuple[_Vector, _Vector]] = [
+            (_limbo(index), _UPRIGHT) for index in range(len(shapes))
+        ]
+        self._velocities: list[tuple[_Vector, _Vector]] = [(_AT_REST, _AT_REST)] * len(shapes)
         link = self._link_state(fresh=True)
         #: Tool point, m, and tool orientation, a quaternion (x, y, z, w), at home.
         self.home_position, self.home_orientation = link[4], link[5]
+        joints = len(self._arm.joints)
+        #: Limits of the arm's joints, rad, and largest speeds, rad/s; then those of fingers, m/s.
+        self.joint_lower, self.joint_upper = self._arm.joint_lower, self._arm.joint_upper
+        self.joint_speed, self.finger_speed = self._arm.speed[:joints], self._arm.speed[joints:]
 
-    def _load_furniture(self) -> None:
-        client = self._client
-        data = Path(pybullet_data.getDataPath())
-        for urdf, position in self._scene.furniture:
-            pybullet.loadURDF(str(data / urdf), position, useFixedBase=True, physicsClientId=client)
-        if self._scene.furniture:
-            return
-        size = (0.75, 0.6, 0.025)
-        self._add_body(_WOOD, pybullet.GEOM_BOX, position=(0.5, 0, -size[2]), halfExtents=size)
-        if self._visuals:
-            pybullet.loadURDF(str(data / "plane.urdf"), (0, 0, -0.7), physicsClientId=client)
-
-    def _load_arm(self, arm: ArmModel) -> None:
-        text, chain, tool_link = prepare_urdf(
-            arm, visuals=self._visuals, fix_fingers=not self._scene.free_fingers
-        )
-        client = self._client
-        flags = pybullet.URDF_USE_INERTIA_FROM_FILE if self._scene.urdf_inertia else 0
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "arm.urdf"
-            file.write_text(text)
-            try:
-                self._arm = pybullet.loadURDF(
-                    str(file), useFixedBase=True, flags=flags, physicsClientId=client
+    def _allow_overlaps(self) -> None:
+        # The collision shapes of neighbouring links overlap, which is not the arm's doing.
+        body = self._arm.body
+        pybullet.performCollisionDetection(physicsClientId=self._client)
+        for point in pybullet.getContactPoints(body, body, physicsClientId=self._client):
+            if point[8] <= 0:
+                pybullet.setCollisionFilterPair(
+                    body, body, point[3], point[4], 0, physicsClientId=self._client
                 )
-            except pybullet.error as error:
-                raise ValueError(f"urdf {arm.urdf!r} does not load in PyBullet.") from error
-        self._find_joints(chain, tool_link)
-        if len(arm.home) != len(self._joints):
-            raise ValueError(
-                f"home must give {len(self._joints)} joint angles, one for each movable joint up "
-                f"to {arm.ee_link!r}, got {len(arm.home)}."
-            )
-        if not np.all((self.joint_lower <= arm.home) & (arm.home <= self.joint_upper)):
-            raise ValueError(
-                f"home must be within the joint limits {self.joint_lower.tolist()} and "
-                f"{self.joint_upper.tolist()}, got {arm.home}."
-            )
 
-    def _find_joints(self, chain: set[str], ee_link: str) -> None:
-        """Sorts the joints into those of the arm and free fingers, and reads their limits."""
-        client = self._client
-        infos = [
-            pybullet.getJointInfo(self._arm, j, physicsClientId=client)
-            for j in range(pybullet.getNumJoints(self._arm, physicsClientId=client))
-        ]
-        movable = [info for info in infos if info[2] != pybullet.JOINT_FIXED]
-        joints = [info for info in movable if info[1].decode() in chain]
-        fingers = [info for info in movable if info[1].decode() not in chain]
-        self._joints = [info[0] for info in joints]
-        self._fingers = [info[0] for info in fingers]
-        # Bullet's Jacobian and inverse kinematics speak of all movable joints.
-        self._columns = [movable.index(info) for info in joints]
-        self._num_movable = len(movable)
-        self._ee = next(info[0] for info in infos if info[12].decode() == ee_link)
-        unlimited = [info[8] >= info[9] for info in joints]
-        self.joint_lower = np.where(unlimited, -np.inf, [info[8] for info in joints])
-        self.joint_upper = np.where(unlimited, np.inf, [info[9] for info in joints])
-        self.joint_speed = np.array([info[11] or np.inf for info in joints])
-        self._efforts = [info[10] or _UNLIMITED_EFFORT for info in joints + fingers]
-
-    def _add_body(
-        self,
-        colour: Sequence[float],
-        geometry: int,
-        *,
-        mass: float = 0.0,
-        position: Sequence[float] = _LIMBO,
-        **size: Any,
-    ) -> int:
-        client = self._client
-        shape = pybullet.createCollisionShape(geometry, physicsClientId=client, **size)
-        skin = -1
-        if self._visuals:
-            # PyBullet calls the same measure "height" of a shape and "length" of its skin.
-            size = {"length" if name == "height" else name: size[name] for name in size}
-            skin = pybullet.createVisualShape(
-                geometry, rgbaColor=colour, physicsClientId=client, **size
-            )
-        return pybullet.createMultiBody(mass, shape, skin, position, physicsClientId=client)
-
-    def _load_brick(self, urdf: str) -> int:
-        path = Path(pybullet_data.getDataPath()) / urdf
-        return pybullet.loadURDF(str(path), _LIMBO, physicsClientId=self._client)
-
-    def _load_marker(self) -> int:
-        skin = pybullet.createVisualShape(
-            pybullet.GEOM_SPHERE, radius=0.02, rgbaColor=_YELLOW, physicsClientId=self._client
-        )
-        return pybullet.createMultiBody(0, -1, skin, _LIMBO, physicsClientId=self._client)
-
-    def reset(self, places: Array, goal: Array) -> None:
-        """Puts the arm at home, the obstacles at ``places`` (m, 3) and the target at ``goal``."""
+    def reset(self, placement: Placement, goal: Array, objects: Array) -> None:
+        """Puts the arm at home, obstacles and objects in their places, the target at ``goal``."""
         client = self._client
         # What can move is taken out of all contacts first: Bullet keeps contact points over a
         # restore, in an order that depends on what happened before.
-        for body in self._movable:
-            self._place(body, _LIMBO)
+        for index, body in enumerate(self._movable):
+            self._place(body, _limbo(index))
         pybullet.performCollisionDetection(physicsClientId=client)
         pybullet.restoreState(self._home, physicsClientId=client)
-        self._goal, self._places = goal.tolist(), places.tolist()
-        for body, place in zip(self._obstacles, self._places, strict=True):
+        self._goal = goal.tolist()
+        self._present = np.flatnonzero(placement.present).tolist()
+        self._placement, self._substeps = placement, 0
+        positions, orientations = self._look_ahead(1)
+        self._follow(positions, orientations, 0)
+        for index, body in enumerate(self._obstacles):
+            if index not in self._present:
+                self._poses[index] = (_limbo(index), _UPRIGHT)
+                self._velocities[index] = (_AT_REST, _AT_REST)
+            self._place(body, *self._poses[index])
+        for body, place in zip(self._objects, objects.tolist(), strict=True):
             self._place(body, place)
         for target in (self._brick, self._marker):
             if target is not None:
                 self._place(target, self._goal)
 
+    def _look_ahead(self, substeps: int) -> tuple[Array, Array]:
+        """Poses of the obstacles from now until after some substeps, one more than these."""
+        times = SUBSTEP * np.arange(self._substeps, self._substeps + substeps + 1, dtype=float)
+        return self._placement.at(times)
+
+    def _follow(self, positions: Array, orientations: Array, substep: int) -> None:
+        """Takes the obstacles' poses and velocities of one of the substeps ahead."""
+        now, later = max(substep - 1, 0), max(substep, 1)
+        linear = (positions[later] - positions[now]) / SUBSTEP
+        angular = rotation_vector(orientations[now], orientations[later]) / SUBSTEP
+        rows = zip(
+            positions[substep].tolist(),
+            orientations[substep].tolist(),
+            linear.tolist(),
+            angular.tolist(),
+            strict=True,
+        )
+        for index, (position, orientation, velocity, spin) in enumerate(rows):
+            if index in self._present:
+                self._poses[index] = (position, orientation)
+                self._velocities[index] = (velocity, spin)
+
     def advance(
-        self, joint_target: Sequence[float], finger_target: Sequence[float], substeps: int
-    ) -> list[float]:
+        self, joint_target: _Vector, finger_target: _Vector, substeps: int
+    ) -> tuple[list[float], list[float], list[list[float]]]:
         """Drives the joints towards a target for some physics substeps.
 
         Returns:
-            For each obstacle the smallest contact distance of all substeps, m; infinite where
-            there was no contact.
+            For each obstacle the smallest contact distance of all substeps, m, infinite where
+            there was no contact; the largest contact force, N; and for each substep the
+            measurements of :meth:`measure`.
         """
-        client = self._client
+        client, arm = self._client, self._arm.body
         self._command(joint_target, finger_target, self._scene.motor_gain or 1 / substeps)
-        distances = [float("inf")] * len(self._obstacles)
-        for _ in range(substeps):
+        distances = [math.inf] * len(self._obstacles)
+        forces = [0.0] * len(self._obstacles)
+        measurements = []
+        moves = self._placement.path is not None
+        ahead = self._look_ahead(substeps) if moves else None
+        senses = self._sensing != Sensing()
+        for substep in range(1, substeps + 1):
+            if ahead is not None:
+                self._follow(*ahead, substep)
+                for index in self._present:
+                    self._place(self._obstacles[index], *self._poses[index])
             pybullet.stepSimulation(physicsClientId=client)
-            for index, body in enumerate(self._obstacles):
-                points = pybullet.getContactPoints(self._arm, body, physicsClientId=client)
-                for point in points:
-                    distances[index] = min(distances[index], point[8])
-        return distances
+            for index in self._present:
+                points = pybullet.getContactPoints(
+                    arm, self._obstacles[index], physicsClientId=client
+                )
+                if points:
+                    nearest, force = min(p[8] for p in points), sum(p[9] for p in points)
+                    distances[index] = min(distances[index], nearest)
+                    forces[index] = max(forces[index], force)
+            if senses:
+                measurements.append(self.measure())
+        self._substeps += substeps
+        return distances, forces, measurements
 
-    def _command(
-        self, joint_target: Sequence[float], finger_target: Sequence[float], gain: float
-    ) -> None:
+    def _command(self, joint_target: _Vector, finger_target: _Vector, gain: float) -> None:
         targets = [*joint_target, *finger_target]
         count = len(targets)
-        limits = {"forces": self._efforts[:count]} if self._scene.motor_limits else {}
+        limits = {"forces": self._arm.effort[:count]} if self._scene.motor_limits else {}
         pybullet.setJointMotorControlArray(
-            self._arm,
-            (self._joints + self._fingers)[:count],
+            self._arm.body,
+            (self._arm.joints + self._arm.fingers)[:count],
             pybullet.POSITION_CONTROL,
             targetPositions=targets,
             positionGains=[gain] * count,
@@ -262,11 +241,11 @@ class World:
             **limits,
         )
 
-    def read(self, *, fresh: bool = False) -> tuple[float, ...]:
-        """Returns the state as one flat row, in the order of :meth:`widths`."""
+    def read(self, *, fresh: bool = False) -> list[float]:
+        """Returns the state as one flat row, in the order of :meth:`read_shapes`."""
         states = self._joint_states()
         link = self._link_state(fresh=fresh or self._scene.fresh_links)
-        arm = len(self._joints)
+        arm = len(self._arm.joints)
         row = [
             *(state[0] for state in states[:arm]),
             *(state[1] for state in states[:arm]),
@@ -276,58 +255,158 @@ class World:
             *_velocity_at(link[4], link[0], link[6], link[7]),
         ]
         row += self._goal if self._brick is None else self._pose(self._brick)[0]
-        velocities: list[float] = []
-        for body, static, place in zip(self._obstacles, self._is_static, self._places, strict=True):
-            row += place if static else self._pose(body)[0]
-            velocities += (
-                (0.0, 0.0, 0.0)
-                if static
-                else pybullet.getBaseVelocity(body, physicsClientId=self._client)[0]
-            )
-        return (*row, *velocities)
+        objects = [(*self._pose(body), *self._velocity(body)) for body in self._objects]
+        obstacles = [
+            (*self._obstacle_pose(index), *self._obstacle_velocity(index))
+            for index in range(len(self._obstacles))
+        ]
+        for bodies in (objects, obstacles):
+            for part in range(4):
+                for body in bodies:
+                    row += body[part]
+        return row
 
-    def widths(self) -> dict[str, int]:
-        """Names and widths of the parts of a row that :meth:`read` returns."""
-        obstacles = 3 * len(self._obstacles)
-        return {
-            "joint_position": len(self._joints),
-            "joint_velocity": len(self._joints),
-            "finger_position": len(self._fingers),
-            "ee_position": 3,
-            "ee_orientation": 4,
-            "ee_velocity": 3,
-            "goal": 3,
-            "obstacle_position": obstacles,
-            "obstacle_velocity": obstacles,
+    def read_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the parts of a row that :meth:`read` returns."""
+        joints = len(self._arm.joints)
+        shapes: dict[str, tuple[int, ...]] = {
+            "joint_position": (joints,),
+            "joint_velocity": (joints,),
+            "finger_position": (len(self._arm.fingers),),
+            "ee_position": (3,),
+            "ee_orientation": (4,),
+            "ee_velocity": (3,),
+            "goal": (3,),
         }
+        for kind, bodies in (("object", self._objects), ("obstacle", self._obstacles)):
+            for part, width in _BODY_PARTS.items():
+                shapes[f"{kind}_{part}"] = (len(bodies), width)
+        return shapes
 
-    def jacobian(self, joint_position: Sequence[float]) -> tuple[Sequence[float], ...]:
+    def measure(self) -> list[float]:
+        """Returns what ``sensing`` asks for as a flat row, in the order of :meth:`trace_shapes`."""
+        sensing, client, row = self._sensing, self._client, []
+        if sensing.clearance:
+            nearest = [self._nearest(index) for index in range(len(self._obstacles))]
+            row = [part for parts in zip(*nearest, strict=True) for part in parts]
+        if sensing.table:
+            row.append(self._touch(self._furniture))
+        if sensing.itself:
+            row.append(self._touch([self._arm.body]))
+        if sensing.joints:
+            row += [state[0] for state in self._joint_states()[: len(self._arm.joints)]]
+        if sensing.tool:
+            link = self._link_state(fresh=True)
+            row += [*link[4], *_velocity_at(link[4], link[0], link[6], link[7])]
+        if sensing.links:
+            body = self._arm.body
+            links = range(pybullet.getNumJoints(body, physicsClientId=client))
+            states = pybullet.getLinkStates(
+                body, links, computeLinkVelocity=1, physicsClientId=client
+            )
+            row += [math.hypot(*state[6]) for state in states]
+        return row
+
+    def trace_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the parts of a row that :meth:`measure` returns."""
+        sensing, obstacles = self._sensing, len(self._obstacles)
+        shapes: dict[str, tuple[int, ...]] = {}
+        if sensing.clearance:
+            names = ("clearance", "arm_approach", "obstacle_approach")
+            shapes |= dict.fromkeys(names, (obstacles,))
+        if sensing.table:
+            shapes["table_distance"] = ()
+        if sensing.itself:
+            shapes["self_distance"] = ()
+        if sensing.joints:
+            shapes["joint_position"] = (len(self._arm.joints),)
+        if sensing.tool:
+            shapes |= {"ee_position": (3,), "ee_velocity": (3,)}
+        if sensing.links:
+            links = pybullet.getNumJoints(self._arm.body, physicsClientId=self._client)
+            shapes["link_speed"] = (links,)
+        return shapes
+
+    def _nearest(self, index: int) -> tuple[float, float, float]:
+        """Distance of arm and obstacle, and the speeds of their closest points to each other."""
+        client, arm = self._client, self._arm.body
+        points = index in self._present and pybullet.getClosestPoints(
+            arm, self._obstacles[index], self._sensing.clearance, physicsClientId=client
+        )
+        if not points:
+            return math.inf, 0.0, 0.0
+        point = min(points, key=lambda point: point[8])
+        link, on_arm, on_obstacle, normal = point[3], point[5], point[6], point[7]
+        arm_velocity: _Vector = _AT_REST
+        if link >= 0:
+            state = pybullet.getLinkState(
+                arm, link, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=client
+            )
+            arm_velocity = _velocity_at(on_arm, state[0], state[6], state[7])
+        centre = self._obstacle_pose(index)[0]
+        obstacle_velocity = _velocity_at(on_obstacle, centre, *self._obstacle_velocity(index))
+        # The normal points from the obstacle to the arm.
+        return point[8], -_dot(arm_velocity, normal), _dot(obstacle_velocity, normal)
+
+    def _touch(self, bodies: Sequence[int]) -> float:
+        """Smallest distance among the contact points of the arm, without its base, and bodies."""
+        return min(
+            (
+                point[8]
+                for body in bodies
+                for point in pybullet.getContactPoints(
+                    self._arm.body, body, physicsClientId=self._client
+                )
+                if point[3] >= 0
+            ),
+            default=math.inf,
+        )
+
+    def clearance(self) -> float:
+        """Returns the smallest distance between arm and obstacles, up to 0.1 m."""
+        points = [
+            point[8]
+            for index in self._present
+            for point in pybullet.getClosestPoints(
+                self._arm.body, self._obstacles[index], 0.1, physicsClientId=self._client
+            )
+        ]
+        return min(points, default=0.1)
+
+    def tool_at(self, joint_position: _Vector) -> tuple[_Vector, _Vector]:
+        """Moves the arm at once; returns tool point and orientation. To be reset afterwards."""
+        self._set_joints([*joint_position, *(0.0 for _ in self._arm.fingers)])
+        link = self._link_state(fresh=True)
+        return link[4], link[5]
+
+    def jacobian(self, joint_position: _Vector) -> tuple[_Vector, ...]:
         """Returns the six rows of the tool point's Jacobian: linear, then angular velocity."""
-        position = [0.0] * self._num_movable
-        for column, angle in zip(self._columns, joint_position, strict=True):
+        arm = self._arm
+        position = [0.0] * arm.num_movable
+        for column, angle in zip(arm.columns, joint_position, strict=True):
             position[column] = angle
-        zeros = [0.0] * self._num_movable
+        zeros = [0.0] * arm.num_movable
         # The point is given in the frame of the link, whose origin is the tool point.
         linear, angular = pybullet.calculateJacobian(
-            self._arm, self._ee, (0.0, 0.0, 0.0), position, zeros, zeros, self._client
+            arm.body, arm.ee, (0.0, 0.0, 0.0), position, zeros, zeros, self._client
         )
-        if self._num_movable == len(self._columns):
+        if arm.num_movable == len(arm.columns):
             return (*linear, *angular)
-        return tuple([row[c] for c in self._columns] for row in (*linear, *angular))
+        return tuple([row[c] for c in arm.columns] for row in (*linear, *angular))
 
-    def inverse_kinematics(
-        self, position: Sequence[float], orientation: Sequence[float]
-    ) -> list[float]:
+    def inverse_kinematics(self, position: _Vector, orientation: _Vector) -> list[float]:
         """Returns the joint angles of Bullet's iterative solver, its default 20 iterations."""
         angles = pybullet.calculateInverseKinematics(
-            self._arm, self._ee, position, orientation, physicsClientId=self._client
+            self._arm.body, self._arm.ee, position, orientation, physicsClientId=self._client
         )
-        return [angles[column] for column in self._columns]
+        return [angles[column] for column in self._arm.columns]
 
     def copy_from(self, other: World) -> None:
         """Takes the state of another world of the same build, for a picture of it."""
         self._set_joints([state[0] for state in other._joint_states()])
-        for mine, theirs in zip(self._obstacles, other._obstacles, strict=True):
+        for index, body in enumerate(self._obstacles):
+            self._place(body, *other._obstacle_pose(index))
+        for mine, theirs in zip(self._objects, other._objects, strict=True):
             self._place(mine, *other._pose(theirs))
         if self._brick is not None and other._brick is not None:
             self._place(self._brick, *other._pose(other._brick))
@@ -353,8 +432,8 @@ class World:
 
     def _link_state(self, *, fresh: bool) -> tuple:
         return pybullet.getLinkState(
-            self._arm,
-            self._ee,
+            self._arm.body,
+            self._arm.ee,
             computeLinkVelocity=1,
             computeForwardKinematics=int(fresh),
             physicsClientId=self._client,
@@ -362,34 +441,56 @@ class World:
 
     def _joint_states(self) -> tuple[tuple[float, float], ...]:
         return pybullet.getJointStates(
-            self._arm, self._joints + self._fingers, physicsClientId=self._client
+            self._arm.body, self._arm.joints + self._arm.fingers, physicsClientId=self._client
         )
 
-    def _set_joints(self, positions: Sequence[float]) -> None:
+    def _set_joints(self, positions: _Vector) -> None:
         pybullet.resetJointStatesMultiDof(
-            self._arm,
-            self._joints + self._fingers,
+            self._arm.body,
+            self._arm.joints + self._arm.fingers,
             [[angle] for angle in positions],
             [[0.0] for _ in positions],
             physicsClientId=self._client,
         )
 
-    def _place(
-        self, body: int, position: Sequence[float], orientation: Sequence[float] = (0, 0, 0, 1)
-    ) -> None:
+    def _place(self, body: int, position: _Vector, orientation: _Vector = _UPRIGHT) -> None:
         pybullet.resetBasePositionAndOrientation(
             body, position, orientation, physicsClientId=self._client
         )
 
-    def _pose(self, body: int) -> tuple[Sequence[float], Sequence[float]]:
+    def _pose(self, body: int) -> tuple[_Vector, _Vector]:
         return pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+
+    def _velocity(self, body: int) -> tuple[_Vector, _Vector]:
+        return pybullet.getBaseVelocity(body, physicsClientId=self._client)
+
+    def _is_simulated(self, index: int) -> bool:
+        # What is not present falls for ever, which nobody wants to know.
+        return not self._is_fixed[index] and index in self._present
+
+    def _obstacle_pose(self, index: int) -> tuple[_Vector, _Vector]:
+        simulated = self._is_simulated(index)
+        return self._pose(self._obstacles[index]) if simulated else self._poses[index]
+
+    def _obstacle_velocity(self, index: int) -> tuple[_Vector, _Vector]:
+        simulated = self._is_simulated(index)
+        return self._velocity(self._obstacles[index]) if simulated else self._velocities[index]
+
+
+_BODY_PARTS = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity": 3}
+
+
+def _limbo(index: int) -> tuple[float, float, float]:
+    """Out of the world, and out of the way of whatever else is there."""
+    return (10.0 * index, 0.0, -100.0)
+
+
+def _dot(first: _Vector, second: _Vector) -> float:
+    return sum(a * b for a, b in zip(first, second, strict=True))
 
 
 def _velocity_at(
-    point: Sequence[float],
-    centre: Sequence[float],
-    linear: Sequence[float],
-    angular: Sequence[float],
+    point: _Vector, centre: _Vector, linear: _Vector, angular: _Vector
 ) -> tuple[float, float, float]:
     """Velocity of a point of a body whose centre of mass has the given velocities."""
     x, y, z = (p - c for p, c in zip(point, centre, strict=True))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import operator
-from typing import Any
+from types import UnionType
+from typing import Any, get_args
 
 import numpy as np
 
@@ -28,10 +29,12 @@ def check_count(**values: int) -> None:
             raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
 
 
-def check_kind(name: str, value: Any, kind: type) -> None:
+def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
     """Raises TypeError unless the value is an object of a class or protocol, not a class."""
     if isinstance(value, type) or not isinstance(value, kind):
-        raise TypeError(f"{name} must be an instance of {kind.__name__}, got {value!r}.")
+        kinds = get_args(kind) or (kind,)
+        names = " or ".join(each.__name__ for each in kinds)
+        raise TypeError(f"{name} must be an instance of {names}, got {value!r}.")
 
 
 def check_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:

@@ -10,7 +10,10 @@ import numpy as np
 
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.checks import check_positive
+from torchrl_safe.envs.rotations import rotation_vector
 from torchrl_safe.envs.state import ArmState, Array
+
+_ITERATIONS, _ARRIVED, _LONGEST_STEP = 100, 0.005, 0.1
 
 
 class InverseKinematics(Protocol):
@@ -23,7 +26,7 @@ class InverseKinematics(Protocol):
 
         Args:
             position: wanted tool points, m, ``(N, 3)``.
-            orientation: wanted tool orientation, a quaternion (x, y, z, w), ``(4,)``.
+            orientation: wanted tool orientations, quaternions (x, y, z, w), ``(N, 4)``.
             state: the current state.
             worlds: the N worlds.
         """
@@ -87,36 +90,35 @@ class BulletInverseKinematics:
     def __call__(
         self, position: Array, orientation: Array, state: ArmState, worlds: Sequence[World]
     ) -> Array:
-        wanted = orientation.tolist()
         return np.array(
             [
-                world.inverse_kinematics(point, wanted)
-                for world, point in zip(worlds, position.tolist(), strict=True)
+                world.inverse_kinematics(*pose)
+                for world, *pose in zip(
+                    worlds, position.tolist(), orientation.tolist(), strict=True
+                )
             ]
         )
 
 
-def rotation_vector(current: Array, wanted: Array) -> Array:
-    """Returns the rotation from current orientations to a wanted one, in world coordinates.
+def distance_to_reach(world: World, start: Sequence[float], point: Array) -> float:
+    """Returns how far from a point the tool stays, m, however it is turned; 0 if it gets there.
 
-    Exact in direction; its length is twice the sine of half the angle, which equals the angle
-    to third order.
+    Moves the arm at once, so that the world is to be reset afterwards.
 
     Args:
-        current: quaternions (x, y, z, w), ``(N, 4)``.
-        wanted: quaternion, ``(4,)``.
-
-    Returns:
-        Rotation vectors, rad, ``(N, 3)``.
-
-    Examples:
-        >>> quarter = np.array([0.0, 0.0, np.sin(0.05), np.cos(0.05)])
-        >>> rotation_vector(np.array([[0.0, 0.0, 0.0, 1.0]]), quarter).round(4)
-        array([[0. , 0. , 0.1]])
+        world: the world.
+        start: joint angles to begin from, rad, ``(n,)``.
+        point: where the tool is to get, m, ``(3,)``.
     """
-    vector, scalar = wanted[:3], wanted[3]
-    current_vector, current_scalar = current[:, :3], current[:, 3:]
-    # The product of the wanted quaternion and the conjugate of the current one.
-    product = current_scalar * vector - scalar * current_vector - np.cross(vector, current_vector)
-    cosine = (current_vector @ vector)[:, None] + current_scalar * scalar
-    return 2 * np.where(cosine < 0, -product, product)
+    angles, nearest = np.array(start, dtype=float), np.inf
+    for _ in range(_ITERATIONS):
+        error = point - world.tool_at(angles.tolist())[0]
+        nearest = min(nearest, float(np.linalg.norm(error)))
+        if nearest < _ARRIVED:
+            return 0.0
+        jacobian = np.array(world.jacobian(angles.tolist())[:3])
+        # Far away the Jacobian is no guide: steps are short.
+        error *= min(1.0, _LONGEST_STEP / float(np.linalg.norm(error)))
+        change = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-3 * np.eye(3), error)
+        angles = np.clip(angles + change, world.joint_lower, world.joint_upper)
+    return nearest

@@ -1,42 +1,90 @@
-"""Observations: functions that map an ArmState to named fields, each of shape (N, width)."""
+"""Observations: callables that map an ArmState to named fields, each of shape (N, width)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from torchrl_safe.envs.checks import check_count
 from torchrl_safe.envs.state import ArmState, Array
 
 
-def full_observation(state: ArmState) -> dict[str, Array]:
-    """What reaching past fixed obstacles needs to be Markov.
+@dataclass(frozen=True)
+class FullObservation:
+    """Everything that makes the task Markov, whatever arm, task and obstacles are.
 
-    Of an obstacle that is free to fall over, its orientation is left out.
+    The fields, in order; those of free fingers and objects are empty where there are none:
 
-    Returns:
-        The fields, in order: ``joint_position`` (rad), ``joint_velocity`` (rad/s),
-        ``ee_position`` (m), ``ee_velocity`` (m/s), ``to_goal`` (from the tool point, m), and for
-        all obstacles ``to_obstacle`` (from the tool point, m), ``obstacle_size`` (half extents,
-        m) and ``obstacle_velocity`` (m/s).
+    - ``joint_position`` (rad), ``joint_velocity`` (rad/s), ``finger_position`` (m)
+    - ``ee_position`` (m), ``ee_velocity`` (m/s), ``to_goal`` (from the tool point, m)
+    - for all objects ``to_object`` (from the tool point, m), ``object_orientation``,
+      ``object_velocity`` (m/s), ``object_angular_velocity`` (rad/s)
+    - for all obstacles ``to_obstacle`` (from the tool point, m), ``obstacle_size`` (half
+      extents, m), ``obstacle_orientation``, ``obstacle_velocity`` (m/s),
+      ``obstacle_angular_velocity`` (rad/s) and ``obstacle_present`` (the mask: 1 or 0)
+
+    Orientations are quaternions (x, y, z, w) with w not negative. Obstacles that are not present
+    are all zeros.
+
+    Args:
+        nearest: number of obstacles that are seen, those whose centres are nearest to the tool
+            point first; filled up with zeros where a world has fewer. A policy then fits any
+            number of obstacles. ``None`` shows all, in their own order.
+
+    Raises:
+        ValueError: if ``nearest`` is not a whole number of at least 1.
 
     Examples:
         >>> from torchrl_safe.envs import ArmEnv
-        >>> env = ArmEnv(observation=full_observation)
-        >>> env.observation_fields["to_goal"]
-        slice(20, 23, None)
+        >>> env = ArmEnv(observation=FullObservation(nearest=3))
+        >>> env.observation_fields["to_goal"], env.observation_fields["obstacle_present"]
+        (slice(20, 23, None), slice(71, 74, None))
         >>> env.close()
     """
-    rows = len(state.ee_position)
-    relative = state.obstacle_position - state.ee_position[:, None]
-    return {
-        "joint_position": state.joint_position,
-        "joint_velocity": state.joint_velocity,
-        "ee_position": state.ee_position,
-        "ee_velocity": state.ee_velocity,
-        "to_goal": state.goal - state.ee_position,
-        "to_obstacle": relative.reshape(rows, -1),
-        "obstacle_size": np.tile(state.obstacle_size.reshape(1, -1), (rows, 1)),
-        "obstacle_velocity": state.obstacle_velocity.reshape(rows, -1),
-    }
+
+    nearest: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.nearest is not None:
+            check_count(nearest=self.nearest)
+
+    def __call__(self, state: ArmState) -> dict[str, Array]:
+        """Returns the fields, each of shape ``(N, width)``."""
+        rows = len(state.ee_position)
+        tool = state.ee_position[:, None]
+        relative = state.obstacle_position - tool
+        obstacles = {
+            "to_obstacle": relative,
+            "obstacle_size": np.broadcast_to(state.obstacle_size, relative.shape),
+            "obstacle_orientation": _canonical(state.obstacle_orientation),
+            "obstacle_velocity": state.obstacle_velocity,
+            "obstacle_angular_velocity": state.obstacle_angular_velocity,
+            "obstacle_present": np.ones((*relative.shape[:2], 1)),
+        }
+        present = state.obstacle_present[:, :, None]
+        obstacles = {name: np.where(present, part, 0) for name, part in obstacles.items()}
+        if self.nearest is not None:
+            distance = np.where(present[:, :, 0], np.linalg.norm(relative, axis=2), np.inf)
+            order = np.argsort(distance, axis=1, kind="stable")[:, : self.nearest, None]
+            missing = self.nearest - order.shape[1]
+            obstacles = {
+                name: np.pad(np.take_along_axis(part, order, 1), ((0, 0), (0, missing), (0, 0)))
+                for name, part in obstacles.items()
+            }
+        return {
+            "joint_position": state.joint_position,
+            "joint_velocity": state.joint_velocity,
+            "finger_position": state.finger_position,
+            "ee_position": state.ee_position,
+            "ee_velocity": state.ee_velocity,
+            "to_goal": state.goal - state.ee_position,
+            "to_object": (state.object_position - tool).reshape(rows, -1),
+            "object_orientation": _canonical(state.object_orientation).reshape(rows, -1),
+            "object_velocity": state.object_velocity.reshape(rows, -1),
+            "object_angular_velocity": state.object_angular_velocity.reshape(rows, -1),
+            **{name: part.reshape(rows, -1) for name, part in obstacles.items()},
+        }
 
 
 def paper_observation(state: ArmState) -> dict[str, Array]:
@@ -46,3 +94,8 @@ def paper_observation(state: ArmState) -> dict[str, Array]:
         "finger_position": state.finger_position,
         "goal": state.goal,
     }
+
+
+def _canonical(quaternion: Array) -> Array:
+    """Of the two quaternions of an orientation, the one whose w is not negative."""
+    return np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)

@@ -1,46 +1,77 @@
-"""Obstacles: their shapes, and layouts that say where they stand."""
+"""Layouts of obstacles: what stands where at the start of an episode."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from torchrl_safe.envs.checks import check_array, check_positive
+from torchrl_safe.envs.checks import check_array, check_count, check_kind, check_positive
+from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.rotations import from_rotation_vector
+from torchrl_safe.envs.shapes import Cylinder, Shape
 from torchrl_safe.envs.state import Array
+
+#: Positions ``(s, m, 3)``, m, and orientations ``(s, m, 4)`` at s times after the start, s.
+Path = Callable[[Array], tuple[Array, Array]]
+
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+_ATTEMPTS = 1000
 
 
 @dataclass(frozen=True)
-class Cylinder:
-    """An upright cylinder.
+class Placement:
+    """The m obstacles of one world in one episode.
 
     Args:
-        radius: m.
-        height: m.
-        mass: kg; 0 fixes it in place, anything else can be pushed and knocked over.
+        position: centres at the start, m, ``(m, 3)``.
+        orientation: quaternions (x, y, z, w), ``(m, 4)``. ``None`` stands all upright.
+        present: which obstacles this episode has, ``(m,)``; the others are out of the world.
+            ``None`` stands for all.
+        path: how the obstacles move, from time 0; only for fixed shapes (mass 0). ``None``
+            leaves them where they are, or to physics.
 
     Raises:
-        ValueError: if a size is not positive or the mass is negative.
+        ValueError: if something has the wrong shape or is not finite.
 
     Examples:
-        >>> Cylinder(radius=0.04, height=0.3).half_extents
-        (0.04, 0.04, 0.15)
+        >>> Placement([[0.5, 0.0, 0.1]]).present
+        array([ True])
     """
 
-    radius: float = 0.05
-    height: float = 0.2
-    mass: float = 0.0
+    position: Array
+    orientation: Array = None  # type: ignore[assignment]
+    present: NDArray[np.bool_] = None  # type: ignore[assignment]
+    path: Path | None = None
 
     def __post_init__(self) -> None:
-        check_positive(radius=self.radius, height=self.height)
-        if not 0 <= self.mass < np.inf:
-            raise ValueError(f"mass must be finite and not negative, got {self.mass}.")
+        count = len(self.position)
+        upright = np.tile(_UPRIGHT, (count, 1))
+        present = np.ones(count, bool) if self.present is None else np.asarray(self.present, bool)
+        if present.shape != (count,):
+            raise ValueError(f"present must have shape {(count,)}, got {present.shape}.")
+        filled = {
+            "position": check_array("position", self.position, (count, 3)),
+            "orientation": check_array(
+                "orientation", upright if self.orientation is None else self.orientation, (count, 4)
+            ),
+            "present": present,
+        }
+        for name, value in filled.items():
+            object.__setattr__(self, name, value)
 
-    @property
-    def half_extents(self) -> tuple[float, float, float]:
-        """Half of the size along x, y and z, m."""
-        return (self.radius, self.radius, self.height / 2)
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """Returns positions ``(s, m, 3)`` and orientations ``(s, m, 4)`` at times ``(s,)``."""
+        if self.path is not None:
+            return self.path(times)
+        repeats = len(times)
+        return (
+            np.repeat(self.position[None], repeats, axis=0),
+            np.repeat(self.orientation[None], repeats, axis=0),
+        )
 
 
 @runtime_checkable
@@ -48,26 +79,46 @@ class Obstacles(Protocol):
     """What :class:`~torchrl_safe.envs.ArmEnv` asks of a layout of obstacles."""
 
     @property
-    def shapes(self) -> tuple[Cylinder, ...]:
+    def shapes(self) -> tuple[Shape, ...]:
         """The shape of each obstacle; the same in every world."""
 
-    def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Array:
-        """Draws the centres of one world's obstacles, m, shape ``(m, 3)``.
+    def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
+        """Places one world's obstacles for an episode.
+
+        The environment asks again, up to 100 times, for obstacles that touch the arm at home.
 
         Args:
             rng: the generator of the world.
-            start: tool point at the start of the episode, m, shape ``(3,)``.
+            start: where the way to the goal begins, m, shape ``(3,)``: the tool point at home,
+                or the object that the task moves.
             goal: target position, m, shape ``(3,)``.
         """
 
 
 @dataclass(frozen=True)
+class NoObstacles:
+    """An empty table.
+
+    Examples:
+        >>> NoObstacles().shapes
+        ()
+    """
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        return ()
+
+    def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
+        return Placement(np.zeros((0, 3)))
+
+
+@dataclass(frozen=True)
 class InFront:
-    """One obstacle between the arm and the target.
+    """One obstacle on the way to the target.
 
     Args:
         gap: horizontal distance between the target and the obstacle's centre, m.
-        shape: the obstacle; it stands on the table.
+        shape: the obstacle.
         direction: horizontal direction in which the obstacle is passed on the way to the
             target. ``None`` takes that from start to target, so that the obstacle always
             stands in the way.
@@ -83,12 +134,13 @@ class InFront:
     """
 
     gap: float = 0.15
-    shape: Cylinder = Cylinder()
+    shape: Shape = Cylinder()
     direction: tuple[float, float, float] | None = None
     height: float | None = None
 
     def __post_init__(self) -> None:
         check_positive(gap=self.gap)
+        check_kind("shape", self.shape, Shape)
         if self.direction is not None:
             direction = check_array("direction", self.direction, (3,))
             if direction[2] != 0 or not direction.any():
@@ -99,35 +151,99 @@ class InFront:
             check_array("height", self.height, ())
 
     @property
-    def shapes(self) -> tuple[Cylinder, ...]:
+    def shapes(self) -> tuple[Shape, ...]:
         return (self.shape,)
 
-    def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Array:
+    def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
         way = np.array(goal - start if self.direction is None else self.direction, dtype=float)
         way[2] = 0
         length = np.linalg.norm(way)
         if self.direction is None and length <= self.gap:
             raise ValueError(
-                f"gap must be less than the horizontal distance from the tool at home to the "
-                f"goal, got a gap of {self.gap} and a distance of {length:.3f}."
+                f"gap must be less than the horizontal distance from the start to the goal, got a "
+                f"gap of {self.gap} and a distance of {length:.3f}."
             )
         centre = goal - self.gap * way / length
-        centre[2] = self.shape.height / 2 if self.height is None else self.height
-        return centre[None]
+        centre[2] = self.shape.half_extents[2] if self.height is None else self.height
+        return Placement(centre[None])
 
 
 @dataclass(frozen=True)
-class NoObstacles:
-    """An empty table.
+class Scattered:
+    """Obstacles at random places that leave start and goal free.
+
+    They stand turned at random, each at least ``clearance`` away from start and goal: room for
+    a gripper that points down. The environment draws again while the arm at home touches one.
+
+    Args:
+        count: number of obstacles, the largest if it varies.
+        fewest: smallest number of obstacles; each episode draws a number up to ``count``, all
+            equally likely. ``None`` always takes ``count``.
+        region: where their lower ends may be. Height 0 stands them on the table.
+        shape: the obstacles.
+        clearance: smallest horizontal distance between an obstacle and start or goal, m.
+        spacing: smallest horizontal distance between two obstacles, m.
+
+    Raises:
+        ValueError: if an argument is not usable, or the region has no room for ``count``
+            obstacles beside start and goal.
 
     Examples:
-        >>> NoObstacles().shapes
-        ()
+        >>> layout = Scattered(count=4, fewest=0)
+        >>> start, goal = np.array([0.35, 0.0, 0.2]), np.array([0.65, 0.0, 0.1])
+        >>> layout.sample(np.random.default_rng(1), start, goal).present
+        array([ True,  True, False, False])
     """
 
-    @property
-    def shapes(self) -> tuple[Cylinder, ...]:
-        return ()
+    count: int = 3
+    fewest: int | None = None
+    region: Region = Region((0.3, -0.4, 0.0), (0.75, 0.4, 0.0))
+    shape: Shape = Cylinder()
+    clearance: float = 0.12
+    spacing: float = 0.02
 
-    def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Array:
-        return np.zeros((0, 3))
+    def __post_init__(self) -> None:
+        check_count(count=self.count)
+        check_kind("region", self.region, Region)
+        check_kind("shape", self.shape, Shape)
+        check_array("clearance", self.clearance, ())
+        check_array("spacing", self.spacing, ())
+        if self.clearance < 0 or self.spacing < 0:
+            raise ValueError(
+                f"clearance and spacing must not be negative, got {self.clearance} and "
+                f"{self.spacing}."
+            )
+        if self.fewest is not None and not 0 <= self.fewest <= self.count:
+            raise ValueError(
+                f"fewest must be between 0 and count = {self.count}, got {self.fewest}."
+            )
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        return (self.shape,) * self.count
+
+    def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
+        count = self.count
+        if self.fewest is not None:
+            count = int(rng.integers(self.fewest, self.count, endpoint=True))
+        position = np.zeros((self.count, 3))
+        for index in range(count):
+            position[index] = self._draw(rng, start, goal, position[:index])
+        yaw = np.zeros((self.count, 3))
+        yaw[:, 2] = rng.uniform(-np.pi, np.pi, self.count)
+        position[:, 2] += self.shape.half_extents[2]
+        return Placement(position, from_rotation_vector(yaw), np.arange(self.count) < count)
+
+    def _draw(self, rng: np.random.Generator, start: Array, goal: Array, others: Array) -> Array:
+        radius = self.shape.footprint
+        ends = np.array([start, goal])[:, :2]
+        for _ in range(_ATTEMPTS):
+            place = self.region.sample(rng)
+            from_ends = np.linalg.norm(ends - place[:2], axis=1) - radius
+            from_others = np.linalg.norm(others[:, :2] - place[:2], axis=1) - 2 * radius
+            if (from_ends >= self.clearance).all() and (from_others >= self.spacing).all():
+                return place
+        raise ValueError(
+            f"region must have room for {self.count} obstacles, {self.clearance} m from start "
+            f"{start.round(3).tolist()} and goal {goal.round(3).tolist()}, got {self.region}."
+        )

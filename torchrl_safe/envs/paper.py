@@ -12,8 +12,10 @@ from torchrl_safe.envs.arms import PANDA
 from torchrl_safe.envs.costs import CONTACT_RANGE, Collision
 from torchrl_safe.envs.kinematics import BulletInverseKinematics
 from torchrl_safe.envs.observations import paper_observation
-from torchrl_safe.envs.obstacles import Cylinder, InFront
+from torchrl_safe.envs.obstacles import InFront
+from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.scene import Scene
+from torchrl_safe.envs.shapes import Cylinder
 from torchrl_safe.envs.tasks import Reach
 
 #: AR1: displacements of the tool point and the position of the fingers, not clipped.
@@ -59,7 +61,7 @@ def paper_env(action: ActionMode = PAPER_CARTESIAN, **kwargs: Any) -> ArmEnv:
     settings: dict[str, Any] = {
         "arm": arm,
         "action": action,
-        "task": Reach(low=(0.6, -0.2, 0.05), high=(0.8, 0.2, 0.05), radius=0.09, order=1),
+        "task": Reach(Region((0.6, -0.2, 0.05), (0.8, 0.2, 0.05)), radius=0.09, order=1),
         "obstacles": InFront(gap=0.2, shape=Cylinder(mass=1.0), direction=(1, 0, 0), height=0.05),
         "costs": {"collision": Collision(margin=CONTACT_RANGE)},
         "observation": paper_observation,

@@ -1,8 +1,10 @@
-"""The record that tasks, costs, actions and observations read."""
+"""The record that tasks, costs, actions and observations read, and what it can be asked for."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +12,78 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+class Trace(dict[str, Array]):
+    """Measurements of every physics substep, by name; asking for a missing one says why."""
+
+    def __missing__(self, name: str) -> NoReturn:
+        raise KeyError(
+            f"{name!r} is measured only if a cost asks for it by its `sensing` property; there is "
+            f"{list(self)}."
+        )
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """What a cost wants to be measured in every physics substep.
+
+    Contacts between arm and obstacles are always measured. Everything else takes time, and is
+    measured only if a cost of the environment asks. The measurements are found by name in
+    :attr:`ArmState.trace`; N worlds, s substeps, m obstacles, n joints, l links:
+
+    Args:
+        clearance: distance up to which the arm is measured against each obstacle, m. Gives
+            ``clearance``, the distance between their surfaces (m, infinite beyond that range),
+            and the speeds (m/s) at which the two closest points move towards each other,
+            ``arm_approach`` and ``obstacle_approach``; each ``(N, s, m)``.
+        table: gives ``table_distance`` (m, ``(N, s)``): the smallest distance of a contact
+            point between the table and the arm without its base, infinite without contact.
+        itself: gives ``self_distance`` (m, ``(N, s)``), the same between links of the arm that
+            do not overlap at home. Links then collide, which they otherwise do not.
+        joints: gives ``joint_position`` (rad, ``(N, s, n)``).
+        tool: gives ``ee_position`` (m) and ``ee_velocity`` (m/s), each ``(N, s, 3)``.
+        links: gives ``link_speed`` (m/s, ``(N, s, l)``), of every link's centre of mass.
+
+    Examples:
+        >>> Sensing(clearance=0.1) | Sensing(clearance=0.3, joints=True)
+        Sensing(clearance=0.3, table=False, itself=False, joints=True, tool=False, links=False)
+    """
+
+    clearance: float = 0.0
+    table: bool = False
+    itself: bool = False
+    joints: bool = False
+    tool: bool = False
+    links: bool = False
+
+    def __or__(self, other: Sensing) -> Sensing:
+        return Sensing(
+            clearance=max(self.clearance, other.clearance),
+            table=self.table or other.table,
+            itself=self.itself or other.itself,
+            joints=self.joints or other.joints,
+            tool=self.tool or other.tool,
+            links=self.links or other.links,
+        )
+
+
+@runtime_checkable
+class Sensor(Protocol):
+    """A cost that wants more to be measured than contacts."""
+
+    def __call__(self, state: ArmState) -> Array:
+        """Returns the cost of each world, shape ``(N,)``."""
+
+    @property
+    def sensing(self) -> Sensing:
+        """What the cost reads in :attr:`ArmState.trace`."""
+
+
 @dataclass(frozen=True)
 class ArmState:
     """State of N worlds after a control step, in SI units and world coordinates.
 
-    n is the number of arm joints, f of free finger joints, m of obstacles.
+    n is the number of arm joints, f of free finger joints, p of objects that the task moves, m
+    of obstacles. Orientations are quaternions (x, y, z, w).
 
     Attributes:
         joint_position: joint angles, rad, ``(N, n)``.
@@ -23,15 +92,25 @@ class ArmState:
         joint_upper: upper joint limits, rad, ``(n,)``.
         finger_position: free finger joints, m, ``(N, f)``.
         ee_position: tool point, m, ``(N, 3)``.
-        ee_orientation: tool orientation as a quaternion (x, y, z, w), ``(N, 4)``.
+        ee_orientation: tool orientation, ``(N, 4)``.
         ee_velocity: velocity of the tool point, m/s, ``(N, 3)``.
         goal: target position, m, ``(N, 3)``.
-        obstacle_position: centres of the obstacles, m, ``(N, m, 3)``.
+        object_position: centres of the objects, m, ``(N, p, 3)``.
+        object_orientation: orientations of the objects, ``(N, p, 4)``.
+        object_velocity: velocities of the objects, m/s, ``(N, p, 3)``.
+        object_angular_velocity: rad/s, ``(N, p, 3)``.
+        obstacle_position: centres of the obstacles, m, ``(N, m, 3)``; far away if not present.
+        obstacle_orientation: orientations of the obstacles, ``(N, m, 4)``.
         obstacle_velocity: velocities of the obstacles, m/s, ``(N, m, 3)``.
-        obstacle_size: half extents of the obstacles along x, y, z, m, ``(m, 3)``.
+        obstacle_angular_velocity: rad/s, ``(N, m, 3)``.
+        obstacle_present: which obstacles a world has, bool, ``(N, m)``.
+        obstacle_size: half extents of the obstacles along their own axes, m, ``(m, 3)``.
         contact_distance: smallest distance between arm and obstacle among the contact points
             of **all** physics substeps of the last control step, m, ``(N, m)``. Negative where
             they overlap, infinite where the simulator reports no contact.
+        contact_force: largest force between arm and obstacle in any of these substeps: the sum
+            of the normal forces at its contact points, N, ``(N, m)``.
+        trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
     """
 
     joint_position: Array
@@ -43,7 +122,16 @@ class ArmState:
     ee_orientation: Array
     ee_velocity: Array
     goal: Array
+    object_position: Array
+    object_orientation: Array
+    object_velocity: Array
+    object_angular_velocity: Array
     obstacle_position: Array
+    obstacle_orientation: Array
     obstacle_velocity: Array
+    obstacle_angular_velocity: Array
+    obstacle_present: NDArray[np.bool_]
     obstacle_size: Array
     contact_distance: Array
+    contact_force: Array
+    trace: Mapping[str, Array] = field(default_factory=Trace)

@@ -8,16 +8,29 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs.checks import check_array, check_positive
+from torchrl_safe.envs.checks import check_kind, check_positive
+from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.shapes import Box, Shape
 from torchrl_safe.envs.state import ArmState, Array
+
+_ATTEMPTS = 1000
 
 
 @runtime_checkable
 class Task(Protocol):
     """What :class:`~torchrl_safe.envs.ArmEnv` asks of a task."""
 
-    def sample_goal(self, rng: np.random.Generator) -> Array:
-        """Draws a goal position of one world, m, shape ``(3,)``."""
+    @property
+    def objects(self) -> tuple[Shape, ...]:
+        """The p objects that the arm is to move; the same in every world."""
+
+    def sample(self, rng: np.random.Generator, goals: Region) -> tuple[Array, Array]:
+        """Draws the goal, m, ``(3,)``, and the objects' centres, m, ``(p, 3)``, of one world.
+
+        Args:
+            rng: the generator of the world.
+            goals: where the arm can reach goals (:attr:`~torchrl_safe.envs.ArmModel.goals`).
+        """
 
     def reward(self, state: ArmState) -> Array:
         """Returns the reward of each world, shape ``(N,)``."""
@@ -28,46 +41,198 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class Reach:
-    """Bring the tool point within ``radius`` of a target drawn uniformly from a box.
+    """Bring the tool point within ``radius`` of a target.
 
     The reward of a step is minus the distance between tool and target, in metres; since
-    success ends the episode, the return is best for a fast approach.
+    success ends the episode (``terminated``), the return is best for a fast approach.
 
     Args:
-        low: lower corner of the box of targets, m.
-        high: upper corner of the box of targets, m.
+        region: where targets are drawn, uniformly. ``None`` takes the arm's ``goals``.
         radius: distance at which the target counts as reached, m.
         order: order of the distance's norm: 2 is Euclidean, 1 is the paper's.
+        sparse: reward each step with -1 until success and 0 at success, instead.
 
     Raises:
-        ValueError: if the box is empty, ``radius`` is not positive or ``order`` is less than 1.
+        TypeError: if ``region`` is not a Region.
+        ValueError: if ``radius`` is not positive or ``order`` is less than 1.
 
     Examples:
         >>> Reach(radius=0.03)
-        Reach(low=(0.6, -0.2, 0.05), high=(0.7, 0.2, 0.15), radius=0.03, order=2)
+        Reach(region=None, radius=0.03, order=2, sparse=False)
     """
 
-    low: tuple[float, float, float] = (0.6, -0.2, 0.05)
-    high: tuple[float, float, float] = (0.7, 0.2, 0.15)
+    region: Region | None = None
     radius: float = 0.05
     order: float = 2
+    sparse: bool = False
 
     def __post_init__(self) -> None:
-        low, high = check_array("low", self.low, (3,)), check_array("high", self.high, (3,))
-        if not np.all(low <= high):
-            raise ValueError(f"low must not exceed high, got {self.low} and {self.high}.")
-        check_positive(radius=self.radius)
+        _check(self.region, self.radius)
         if not self.order >= 1:
             raise ValueError(f"order must be at least 1, got {self.order}.")
 
-    def sample_goal(self, rng: np.random.Generator) -> Array:
-        return rng.uniform(self.low, self.high)
+    @property
+    def objects(self) -> tuple[Shape, ...]:
+        return ()
+
+    def sample(self, rng: np.random.Generator, goals: Region) -> tuple[Array, Array]:
+        return (self.region or goals).sample(rng), np.zeros((0, 3))
 
     def reward(self, state: ArmState) -> Array:
-        return -self._distance(state)
+        return _reward(self._distance(state), self.radius, self.sparse)
 
     def success(self, state: ArmState) -> NDArray[np.bool_]:
         return self._distance(state) < self.radius
 
     def _distance(self, state: ArmState) -> Array:
         return np.linalg.norm(state.ee_position - state.goal, ord=self.order, axis=1)
+
+
+@dataclass(frozen=True)
+class Push:
+    """Push a cube over the table to a goal.
+
+    Reward, success within 0.05 m and the cube are those of panda-gym's PandaPush (Gallouédec et
+    al. 2021, arXiv 2106.13687): the reward of a step is minus the distance between cube and goal,
+    in metres; success ends the episode (``terminated``). Other than there, the cube never starts
+    near its goal, so that there is a way to go and room for an obstacle on it.
+
+    Args:
+        region: where the cube and its goal are drawn, uniformly; heights do not matter. ``None``
+            takes the arm's ``goals``.
+        radius: distance between cube and goal at which the task is done, m.
+        distance: smallest distance between cube and goal at the start, m.
+        shape: the object; it starts upright on the table.
+        sparse: reward each step with -1 until success and 0 at success, instead.
+
+    Raises:
+        TypeError: if ``region`` or ``shape`` is not of its kind.
+        ValueError: if a length is not positive or the shape has no mass; when the region is
+            too small for the distance.
+
+    Examples:
+        >>> region = Region((0.5, -0.2, 0.0), (0.6, 0.2, 0.0))
+        >>> goal, cube = Push().sample(np.random.default_rng(0), region)
+        >>> float(goal[2]), cube.shape
+        (0.02, (1, 3))
+    """
+
+    region: Region | None = None
+    radius: float = 0.05
+    distance: float = 0.3
+    shape: Shape = Box((0.02, 0.02, 0.02), mass=1.0)
+    sparse: bool = False
+
+    def __post_init__(self) -> None:
+        _check(self.region, self.radius, self.shape)
+        check_positive(distance=self.distance)
+
+    @property
+    def objects(self) -> tuple[Shape, ...]:
+        return (self.shape,)
+
+    def sample(self, rng: np.random.Generator, goals: Region) -> tuple[Array, Array]:
+        return _apart(rng, self.region or goals, self.distance, self.shape)
+
+    def reward(self, state: ArmState) -> Array:
+        return _reward(_object_distance(state), self.radius, self.sparse)
+
+    def success(self, state: ArmState) -> NDArray[np.bool_]:
+        return _object_distance(state) < self.radius
+
+
+@dataclass(frozen=True)
+class PickAndPlace:
+    """Grasp a cube and bring it to a goal, in the air or on the table.
+
+    Reward, success within 0.05 m, the cube and the share of goals on the table are those of
+    panda-gym's PandaPickAndPlace (Gallouédec et al. 2021, arXiv 2106.13687); success ends the
+    episode (``terminated``). As in :class:`Push`, the cube never starts near its goal. The action
+    must move the fingers: ``CartesianDelta(finger_step=0.04)``.
+
+    Args:
+        region: where the goal is drawn, uniformly, and the cube below. ``None`` takes the arm's
+            ``goals``.
+        radius: distance between cube and goal at which the task is done, m.
+        distance: smallest horizontal distance between cube and goal at the start, m.
+        on_table: share of the goals that lie on the table.
+        shape: the object; it starts upright on the table.
+        sparse: reward each step with -1 until success and 0 at success, instead.
+
+    Raises:
+        TypeError: if ``region`` or ``shape`` is not of its kind.
+        ValueError: if a length is not positive, the shape has no mass or ``on_table`` is not a
+            share; when the region is too small for the distance, or the fingers do not move.
+
+    Examples:
+        >>> PickAndPlace(on_table=0.0).objects
+        (Box(half_extents=(0.02, 0.02, 0.02), mass=1.0),)
+    """
+
+    region: Region | None = None
+    radius: float = 0.05
+    distance: float = 0.3
+    on_table: float = 0.3
+    shape: Shape = Box((0.02, 0.02, 0.02), mass=1.0)
+    sparse: bool = False
+
+    def __post_init__(self) -> None:
+        _check(self.region, self.radius, self.shape)
+        check_positive(distance=self.distance)
+        if not 0 <= self.on_table <= 1:
+            raise ValueError(f"on_table must be between 0 and 1, got {self.on_table}.")
+
+    @property
+    def objects(self) -> tuple[Shape, ...]:
+        return (self.shape,)
+
+    def sample(self, rng: np.random.Generator, goals: Region) -> tuple[Array, Array]:
+        region = self.region or goals
+        goal, objects = _apart(rng, region, self.distance, self.shape)
+        if rng.random() >= self.on_table:
+            goal[2] += rng.uniform(region.low[2], region.high[2])
+        return goal, objects
+
+    def reward(self, state: ArmState) -> Array:
+        if not state.finger_position.shape[1]:
+            raise ValueError(
+                "action must move the fingers to pick something up, such as "
+                "CartesianDelta(finger_step=0.04); this one has no finger_step."
+            )
+        return _reward(_object_distance(state), self.radius, self.sparse)
+
+    def success(self, state: ArmState) -> NDArray[np.bool_]:
+        return _object_distance(state) < self.radius
+
+
+def _check(region: Region | None, radius: float, shape: Shape | None = None) -> None:
+    if region is not None:
+        check_kind("region", region, Region)
+    check_positive(radius=radius)
+    if shape is not None:
+        check_kind("shape", shape, Shape)
+        if not shape.mass:
+            raise ValueError(f"shape must have a mass to be moved, got {shape}.")
+
+
+def _reward(distance: Array, radius: float, sparse: bool) -> Array:
+    return -(distance >= radius).astype(float) if sparse else -distance
+
+
+def _object_distance(state: ArmState) -> Array:
+    return np.linalg.norm(state.object_position[:, 0] - state.goal, axis=1)
+
+
+def _apart(
+    rng: np.random.Generator, region: Region, distance: float, shape: Shape
+) -> tuple[Array, Array]:
+    """Draws a goal and an object on the table, at least some distance apart."""
+    height = shape.half_extents[2]
+    for _ in range(_ATTEMPTS):
+        goal, place = region.sample(rng), region.sample(rng)
+        goal[2] = place[2] = height
+        if np.linalg.norm(goal - place) >= distance:
+            return goal, place[None]
+    raise ValueError(
+        f"region must be wide enough for goals at a distance of {distance} m, got {region}."
+    )

@@ -1,0 +1,78 @@
+"""Quaternions (x, y, z, w), one or many: the last axis holds the four numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_safe.envs.state import Array
+
+
+def rotation_vector(current: Array, wanted: Array) -> Array:
+    """Returns the rotation from current orientations to wanted ones, in world coordinates.
+
+    Exact in direction; its length is twice the sine of half the angle, which equals the angle
+    to third order.
+
+    Args:
+        current: quaternions, ``(..., 4)``.
+        wanted: quaternions, ``(..., 4)``.
+
+    Returns:
+        Rotation vectors, rad, ``(..., 3)``.
+
+    Examples:
+        >>> quarter = np.array([0.0, 0.0, np.sin(0.05), np.cos(0.05)])
+        >>> rotation_vector(np.array([0.0, 0.0, 0.0, 1.0]), quarter).round(4)
+        array([0. , 0. , 0.1])
+    """
+    difference = multiply(wanted, current * (-1, -1, -1, 1))
+    return 2 * np.where(difference[..., 3:] < 0, -1, 1) * difference[..., :3]
+
+
+def multiply(first: Array, second: Array) -> Array:
+    """Returns the orientations after turning by ``second``, then by ``first``, ``(..., 4)``.
+
+    Examples:
+        >>> half = np.array([0.0, 0.0, 1.0, 0.0])
+        >>> multiply(half, half)
+        array([ 0.,  0.,  0., -1.])
+    """
+    vector, scalar = first[..., :3], first[..., 3:]
+    other, other_scalar = second[..., :3], second[..., 3:]
+    product = scalar * other + other_scalar * vector + np.cross(vector, other)
+    return np.concatenate(
+        [
+            product,
+            scalar * other_scalar - (vector * other).sum(axis=-1, keepdims=True),
+        ],
+        axis=-1,
+    )
+
+
+def from_rotation_vector(vector: Array) -> Array:
+    """Returns the quaternions of rotation vectors, rad, ``(..., 3)``.
+
+    Examples:
+        >>> from_rotation_vector(np.array([0.0, 0.0, np.pi])).round(4)
+        array([0., 0., 1., 0.])
+    """
+    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+    # numpy's sinc is sin(pi x) / (pi x), which is 1 at 0.
+    return np.concatenate(
+        [vector / 2 * np.sinc(angle / (2 * np.pi)), np.cos(angle / 2)],
+        axis=-1,
+    )
+
+
+def from_z_axis(axis: Array) -> Array:
+    """Returns the shortest rotations that bring the z axis to given unit vectors, ``(..., 3)``.
+
+    Examples:
+        >>> from_z_axis(np.array([1.0, 0.0, 0.0])) @ [0, 0.5**0.5, 0, 0.5**0.5]
+        np.float64(1.0)
+    """
+    x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
+    turn = np.stack([-y, x, np.zeros_like(x), 1 + z], axis=-1)
+    length = np.linalg.norm(turn, axis=-1, keepdims=True)
+    # Straight down the axis of the half turn is free: x is taken.
+    return np.where(length < 1e-9, (1.0, 0.0, 0.0, 0.0), turn / np.maximum(length, 1e-9))

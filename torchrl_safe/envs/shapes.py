@@ -1,0 +1,154 @@
+"""Shapes of obstacles and of the objects that tasks move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_safe.envs.checks import check_array, check_positive
+
+
+def _check_mass(mass: float) -> None:
+    if not 0 <= mass < np.inf:
+        raise ValueError(f"mass must be finite and not negative, got {mass}.")
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder along its z axis.
+
+    Args:
+        radius: m.
+        height: m.
+        mass: kg; 0 fixes it in place, anything else can be pushed and knocked over.
+
+    Raises:
+        ValueError: if a size is not positive or the mass is negative.
+
+    Examples:
+        >>> Cylinder(radius=0.04, height=0.3).half_extents
+        (0.04, 0.04, 0.15)
+    """
+
+    radius: float = 0.05
+    height: float = 0.2
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive(radius=self.radius, height=self.height)
+        _check_mass(self.mass)
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """Half of the size along the shape's own x, y and z axes, m."""
+        return (self.radius, self.radius, self.height / 2)
+
+    @property
+    def footprint(self) -> float:
+        """Radius of the circle around the upright shape seen from above, m."""
+        return self.radius
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cuboid.
+
+    Args:
+        half_extents: half of the size along its own x, y and z axes, m.
+        mass: kg; 0 fixes it in place.
+
+    Raises:
+        ValueError: if a size is not positive or the mass is negative.
+
+    Examples:
+        >>> Box(half_extents=(0.02, 0.02, 0.02), mass=1.0).mass
+        1.0
+    """
+
+    half_extents: tuple[float, float, float] = (0.05, 0.05, 0.1)
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (check_array("half_extents", self.half_extents, (3,)) > 0).all():
+            raise ValueError(f"half_extents must be positive, got {self.half_extents}.")
+        _check_mass(self.mass)
+
+    @property
+    def footprint(self) -> float:
+        """Radius of the circle around the upright shape seen from above, m."""
+        return float(np.hypot(*self.half_extents[:2]))
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball.
+
+    Args:
+        radius: m.
+        mass: kg; 0 fixes it in place.
+
+    Raises:
+        ValueError: if the radius is not positive or the mass is negative.
+
+    Examples:
+        >>> Sphere(0.1).half_extents
+        (0.1, 0.1, 0.1)
+    """
+
+    radius: float = 0.08
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive(radius=self.radius)
+        _check_mass(self.mass)
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """Half of the size along the shape's own x, y and z axes, m."""
+        return (self.radius,) * 3
+
+    @property
+    def footprint(self) -> float:
+        """Radius of the circle around the upright shape seen from above, m."""
+        return self.radius
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A cylinder along its z axis with a half ball at each end.
+
+    Args:
+        radius: m.
+        length: distance between the centres of the half balls, m.
+        mass: kg; 0 fixes it in place.
+
+    Raises:
+        ValueError: if a size is not positive or the mass is negative.
+
+    Examples:
+        >>> Capsule(radius=0.05, length=0.3).half_extents
+        (0.05, 0.05, 0.2)
+    """
+
+    radius: float = 0.05
+    length: float = 0.1
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive(radius=self.radius, length=self.length)
+        _check_mass(self.mass)
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """Half of the size along the shape's own x, y and z axes, m."""
+        return (self.radius, self.radius, self.length / 2 + self.radius)
+
+    @property
+    def footprint(self) -> float:
+        """Radius of the circle around the upright shape seen from above, m."""
+        return self.radius
+
+
+#: What an obstacle or an object can look like.
+Shape = Cylinder | Box | Sphere | Capsule
