@@ -147,3 +147,19 @@ def test_missing_extra_is_named(monkeypatch):
     monkeypatch.setattr(importlib.metadata, "distribution", missing)
     with pytest.raises(ValueError, match=r"example-robot-data need .*torchrl-safe\[more-arms\]"):
         find_urdf("ur_description/urdf/ur5_robot.urdf")
+
+
+def test_frames_weigh_nothing(tmp_path):
+    """PyBullet gives 1 kg to a link without inertia."""
+    path = make_urdf(
+        tmp_path / "arm.urdf",
+        '<link name="base"/><link name="beam"/><joint name="turn" type="continuous">',
+        '<parent link="base"/><child link="beam"/></joint>',
+        '<link name="tip"/><joint name="end" type="fixed">',
+        '<parent link="beam"/><child link="tip"/></joint>',
+    )
+    text = prepare_urdf(arm(path, "tip"), visuals=False, fix_fingers=True).text
+    masses = {link.get("name"): link.find("inertial/mass") for link in ElementTree.fromstring(text)}
+    assert masses["tip"].get("value") == "0"
+    # What moves needs inertia, and has that of PyBullet.
+    assert masses["base"] is masses["beam"] is None

@@ -2,7 +2,17 @@
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
-from torchrl_safe.envs.arms import PANDA, ArmModel, Gripper
+from torchrl_safe.envs.arms import (
+    IIWA,
+    PANDA,
+    PARALLEL_GRIPPER,
+    UR5,
+    UR10,
+    XARM6,
+    XARM7,
+    ArmModel,
+    Gripper,
+)
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.costs import (
     Collision,
@@ -30,9 +40,15 @@ from torchrl_safe.envs.state import ArmState, Sensing, Sensor
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
 
 __all__ = [
+    "IIWA",
     "PANDA",
     "PAPER_CARTESIAN",
     "PAPER_JOINT",
+    "PARALLEL_GRIPPER",
+    "UR5",
+    "UR10",
+    "XARM6",
+    "XARM7",
     "ActionMode",
     "ArmEnv",
     "ArmModel",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torchrl_safe.envs.checks import check_array
 from torchrl_safe.envs.regions import Region
@@ -74,9 +74,57 @@ class ArmModel:
     gripper: Gripper | None = None
 
 
+#: A small parallel gripper of our own for any flange: 0.5 kg, opens by 0.04 m to each side.
+PARALLEL_GRIPPER = Gripper("gripper.urdf", tool_link="tool")
+
 #: Franka Emika Panda with its hand closed; at home the tool points down at (0.35, 0, 0.2) m.
 PANDA = ArmModel(
     urdf="franka_panda/panda.urdf",
     ee_link="panda_grasptarget",
     home=(0.0, -0.395, 0.0, -2.849, 0.0, 2.454, 0.7854),
+)
+
+#: KUKA LBR iiwa 14; at home the tool points down at (0.42, 0, 0.25) m: its elbow cannot fold
+#: further, and its reach with the tool down ends at 0.8 m, which leaves a narrow strip of goals.
+IIWA = ArmModel(
+    urdf="kuka_iiwa/model.urdf",
+    ee_link="lbr_iiwa_link_7",
+    home=(0.0, 0.3292, 0.0, -2.0221, 0.0, 0.7903, 0.0),
+    goals=Region((0.65, -0.2, 0.05), (0.7, 0.2, 0.15)),
+    # The link's frame lies inside its body; the flange is 45 mm further out.
+    gripper=replace(PARALLEL_GRIPPER, position=(0.0, 0.0, 0.045)),
+)
+
+#: UFACTORY xArm 6; at home the tool points down at (0.25, 0, 0.2) m.
+XARM6 = ArmModel(
+    urdf="xarm/xarm6_robot.urdf",
+    ee_link="link6",
+    home=(0.0, -0.7665, -0.257, 0.0, 1.0235, 0.0),
+    goals=Region((0.48, -0.2, 0.05), (0.58, 0.2, 0.15)),
+    gripper=PARALLEL_GRIPPER,
+)
+
+#: UFACTORY xArm 7; at home the tool points down at (0.25, 0, 0.2) m. Needs ``more-arms``.
+XARM7 = ArmModel(
+    urdf="xarm_description/urdf/xarm7.urdf",
+    ee_link="link_eef",
+    home=(0.0, -0.7224, 0.0, 0.2634, 0.0, 0.9858, 0.0),
+    goals=Region((0.48, -0.2, 0.05), (0.58, 0.2, 0.15)),
+    gripper=PARALLEL_GRIPPER,
+)
+
+#: Universal Robots UR5; at home the tool points down at (0.35, 0, 0.2) m. Needs ``more-arms``.
+UR5 = ArmModel(
+    urdf="ur_description/urdf/ur5_robot.urdf",
+    ee_link="tool0",
+    home=(-0.3171, -1.9041, 2.1843, -1.851, -1.5708, 1.2536),
+    gripper=PARALLEL_GRIPPER,
+)
+
+#: Universal Robots UR10; at home the tool points down at (0.35, 0, 0.2) m. Needs ``more-arms``.
+UR10 = ArmModel(
+    urdf="ur_description/urdf/ur10_robot.urdf",
+    ee_link="tool0",
+    home=(-0.4875, -2.1153, 2.5841, -2.0396, -1.5708, 1.0833),
+    gripper=PARALLEL_GRIPPER,
 )

@@ -115,9 +115,21 @@ def _read(name: str, *, visuals: bool) -> ElementTree.Element:
         for link in root.iter("link"):
             for visual in link.findall("visual"):
                 link.remove(visual)
+    _weigh_frames(root)
     for mesh in root.iter("mesh"):
         mesh.set("filename", str(_find_mesh(path, mesh.get("filename", ""))))
     return root
+
+
+def _weigh_frames(root: ElementTree.Element) -> None:
+    # A link without inertia only names a frame, but PyBullet would give it 1 kg.
+    fixed = {_end(j, "child") for j in root.findall("joint") if j.get("type") == "fixed"}
+    for link in root.findall("link"):
+        if link.get("name") in fixed and link.find("inertial") is None:
+            inertial = ElementTree.SubElement(link, "inertial")
+            ElementTree.SubElement(inertial, "mass", value="0")
+            zeros = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+            ElementTree.SubElement(inertial, "inertia", zeros)
 
 
 def _attach(arm: ElementTree.Element, ee_link: str, gripper: Gripper, *, visuals: bool) -> str:
