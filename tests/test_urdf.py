@@ -117,6 +117,9 @@ def test_gripper_is_attached(tmp_path):
     assert movable(root) == {"gripper/slide", "gripper/follow"}
     fixed = prepare_urdf(arm(flange, "palm", gripper), visuals=False, fix_fingers=True)
     assert not movable(ElementTree.fromstring(fixed.text))
+    # A joint between flange and tool is one of the arm's, wherever it is written.
+    tip = arm(flange, "palm", Gripper(claw, "tip"))
+    assert prepare_urdf(tip, visuals=False, fix_fingers=True).joints == {"gripper/slide"}
 
 
 def test_unknown_tool_link_is_named():

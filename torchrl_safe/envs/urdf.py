@@ -42,11 +42,11 @@ def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool) -> Prepared
         ValueError: if a file is missing or not XML, a mesh is missing or there is no such link.
     """
     root = _read(arm.urdf, visuals=visuals)
-    chain = movable_chain(root, arm.ee_link)
     tool_link = arm.ee_link
+    _check_link("ee_link", root, tool_link)
     if arm.gripper is not None:
         tool_link = _attach(root, arm.ee_link, arm.gripper, visuals=visuals)
-        chain = movable_chain(root, tool_link)
+    chain = movable_chain(root, tool_link)
     if fix_fingers:
         for joint in root.findall("joint"):
             if joint.get("name") not in chain:
@@ -75,12 +75,7 @@ def find_urdf(name: str) -> Path:
 
 
 def movable_chain(root: ElementTree.Element, tip: str) -> set[str]:
-    """Returns the names of the movable joints between the base and a link.
-
-    Raises:
-        ValueError: if the URDF has no link of that name.
-    """
-    _check_link("ee_link", root, tip)
+    """Returns the names of the movable joints between the base and a link."""
     parents = {_end(joint, "child"): joint for joint in root.findall("joint")}
     chain = set()
     link = tip
