@@ -29,10 +29,6 @@ ARMS = {"panda": PANDA, "iiwa": IIWA, "xarm6": XARM6, "xarm7": XARM7, "ur5": UR5
 each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
 
 
-def reaching(arm, **kwargs):
-    return Reach(low=arm.goals.low, high=arm.goals.high, **kwargs)
-
-
 class Pose:
     """The geometry of an arm over a table, without dynamics."""
 
@@ -173,7 +169,7 @@ def test_goals_and_the_table_before_them_are_reached(pose, arm):
 
 @each_arm
 def test_obstacles_leave_the_arm_free_at_home(make_env, arm):
-    env = make_env(ArmEnv, arm, task=reaching(arm), seed=0)
+    env = make_env(ArmEnv, arm, task=Reach(), seed=0)
     for _ in range(50):
         env.reset()
         way = env.arm_state.goal - env.arm_state.ee_position
@@ -184,7 +180,7 @@ def test_obstacles_leave_the_arm_free_at_home(make_env, arm):
 @each_arm
 def test_motors_hold_the_arm_and_bring_it_to_the_goals(make_env, arm):
     """Within the efforts and speeds of the URDF, on straight lines, with the gripper's weight."""
-    task = reaching(arm, radius=0.01)
+    task = Reach(radius=0.01)
     env = make_env(ArmEnv, arm, num_envs=8, obstacles=NoObstacles(), task=task, seed=0)
     env.reset()
     home = env.arm_state.ee_position
@@ -221,7 +217,11 @@ def test_fingers_open_and_close(make_env, arm):
             step(env, torch.tensor([[0.0, 0.0, 0.0, share]]))
         np.testing.assert_allclose(env.arm_state.finger_position, 0.04 * share, atol=1e-4)
         gap = pybullet.getClosestPoints(
-            world._arm, world._arm, 0.1, *world._fingers, physicsClientId=world._client
+            world._arm.body,
+            world._arm.body,
+            0.1,
+            *world._arm.fingers,
+            physicsClientId=world._client,
         )
         assert min(point[8] for point in gap) == pytest.approx(0.08 * share, abs=3e-3)
     np.testing.assert_allclose(env.arm_state.ee_position, home, atol=5e-4)

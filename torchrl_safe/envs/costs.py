@@ -151,11 +151,11 @@ class JointLimit:
         ValueError: if ``margin`` is negative or not finite.
 
     Examples:
-        >>> JointLimit(margin=0.05)
-        JointLimit(margin=0.05)
+        >>> JointLimit(margin=0.1)
+        JointLimit(margin=0.1)
     """
 
-    margin: float = 0.1
+    margin: float = 0.05
 
     def __post_init__(self) -> None:
         _check_limit(margin=self.margin)
