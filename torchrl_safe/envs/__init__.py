@@ -16,6 +16,7 @@ from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, paper_env
 from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.state import ArmState
 from torchrl_safe.envs.tasks import Reach, Task
+from torchrl_safe.envs.transforms import CostToReward
 
 __all__ = [
     "PANDA",
@@ -29,6 +30,7 @@ __all__ = [
     "Camera",
     "CartesianDelta",
     "Collision",
+    "CostToReward",
     "Cylinder",
     "DampedLeastSquares",
     "InFront",
