@@ -38,6 +38,7 @@ from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
+from torchrl_safe.envs.transforms import CostToReward
 
 __all__ = [
     "IIWA",
@@ -60,6 +61,7 @@ __all__ = [
     "CartesianDelta",
     "Collision",
     "ContactForce",
+    "CostToReward",
     "Cylinder",
     "DampedLeastSquares",
     "FullObservation",

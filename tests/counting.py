@@ -1,0 +1,113 @@
+"""Environments that count steps, so that what they return can be worked out by hand.
+
+In step t of an episode of n steps: observation t, reward 10 t, cost t / 4.
+"""
+
+from typing import ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
+
+FLAGS = ("done", "terminated", "truncated")
+
+
+class Counting(gymnasium.Env):
+    """Ends after n steps: truncated, or terminated if n is odd."""
+
+    metadata: ClassVar = {"render_modes": []}
+    observation_space = Box(0, 1000, (1,), np.float32)
+    action_space = Box(-1, 1, (1,), np.float32)
+    render_mode = None
+
+    def __init__(self, steps=4):
+        self.steps = steps
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        # Costs at a reset belong to no step: nobody may read them.
+        return np.zeros(1, np.float32), {"cost": -99.0}
+
+    def info(self):
+        return {"cost": self.count / 4, "costs": {"one": 1.0, "count": float(self.count)}}
+
+    def step(self, action):
+        self.count += 1
+        over = self.count >= self.steps
+        odd = self.steps % 2 == 1
+        observation = np.full(1, self.count, np.float32)
+        return observation, 10.0 * self.count, over and odd, over and not odd, self.info()
+
+
+class SixTuple(Counting):
+    """Returns the cost as Safety-Gymnasium does."""
+
+    def step(self, action):
+        *outcome, terminated, truncated, info = super().step(action)
+        cost = info.pop("cost")
+        return *outcome, cost, terminated, truncated, info
+
+
+class Forgetful(Counting):
+    """Reports no cost in its second step."""
+
+    def info(self):
+        return {} if self.count == 2 else super().info()
+
+
+for kind in (Counting, SixTuple, Forgetful):
+    gymnasium.register(f"{kind.__name__}-v0", entry_point=f"{__name__}:{kind.__name__}")
+
+
+class CountingBatch(EnvBase):
+    """The same as a TorchRL environment that takes its costs for observations.
+
+    Row r ends, truncated, after r + 2 steps. Costs t / 4 as asked for by the specs.
+    """
+
+    def __init__(self, num_envs=None, costs=None):
+        batch = () if num_envs is None else (num_envs,)
+        super().__init__(batch_size=batch)
+        costs = {"cost": batch} if costs is None else costs
+        self.costs = {key: Unbounded(shape, dtype=torch.float64) for key, shape in costs.items()}
+        self.observation_spec = Composite(
+            {"observation": Unbounded((*batch, 1)), **self.costs}, shape=batch
+        )
+        self.action_spec = Unbounded((*batch, 1))
+        self.reward_spec = Unbounded((*batch, 1))
+        self.done_spec = Composite(
+            {key: Unbounded((*batch, 1), dtype=torch.bool) for key in FLAGS},
+            shape=batch,
+        )
+        self.count = torch.zeros(*batch, 1)
+        self.steps = torch.arange(self.count.numel()).view_as(self.count) + 2
+
+    def _observe(self, **others):
+        out = TensorDict({"observation": self.count.clone(), **others}, self.batch_size)
+        for place, (key, spec) in enumerate(self.costs.items()):
+            column = (self.count.double() / 4 + 100 * place).reshape(self.batch_size)
+            shaped = column if spec.ndim == len(self.batch_size) else column.unsqueeze(-1)
+            out[key] = shaped.expand(spec.shape).clone()
+        return out
+
+    def _reset(self, tensordict=None, **kwargs):
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = torch.ones_like(self.count, dtype=torch.bool) if mask is None else mask
+        self.count = torch.where(mask, 0.0, self.count)
+        return self._observe()
+
+    def _step(self, tensordict):
+        self.count = self.count + 1
+        over = self.count >= self.steps
+        never = torch.zeros_like(over)
+        return self._observe(
+            reward=10 * self.count, done=over, terminated=never, truncated=over.clone()
+        )
+
+    def _set_seed(self, seed):
+        pass

@@ -1,0 +1,336 @@
+"""SafeGymWrapper and SafeGymEnv: what Gymnasium's environments return, with costs beside rewards.
+
+All numbers are those of counting.py: in step t, observation t, reward 10 t, cost t / 4.
+"""
+
+import multiprocessing
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from counting import Counting, Forgetful
+from gymnasium.spaces import Box, Dict
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torchrl.collectors import Collector
+from torchrl.data import Unbounded
+from torchrl.envs import (
+    ParallelEnv,
+    RewardSum,
+    SerialEnv,
+    default_info_dict_reader,
+)
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_safe.envs.gym import SafeGymEnv, SafeGymWrapper
+
+MODES = [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
+by_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+
+
+def vector(mode, *factories, kind=SyncVectorEnv):
+    factories = factories or (partial(Counting, 4), partial(Counting, 3))
+    return kind(factories, autoreset_mode=mode)
+
+
+def check_counts(rollout, lengths):
+    """Compares a rollout of episodes of these lengths, a row each, with what they must be."""
+    steps = rollout.shape[-1]
+    count = torch.stack([torch.arange(steps) % length for length in lengths]).float()
+    after, over = count + 1, count + 1 == torch.tensor(lengths)[:, None]
+    odd = torch.tensor(lengths)[:, None] % 2 == 1
+    rollout = rollout.reshape(len(lengths), steps)
+    for key, expected in {
+        "observation": count,
+        ("next", "observation"): after,
+        ("next", "reward"): 10 * after,
+        ("next", "done"): over,
+        ("next", "terminated"): over & odd,
+        ("next", "truncated"): over & ~odd,
+    }.items():
+        assert torch.equal(rollout[key].squeeze(-1), expected), key
+    assert torch.equal(rollout["next", "cost"][..., 0], after / 4)
+    assert rollout["next", "cost"].dtype == torch.float32
+    assert "cost" not in rollout
+
+
+@pytest.mark.parametrize("kind", ["Counting", "SixTuple"])
+@pytest.mark.parametrize("steps", [3, 4], ids=["terminated", "truncated"])
+def test_single(make_env, kind, steps):
+    env = make_env(SafeGymEnv, f"counting:{kind}-v0", steps=steps)
+    check_env_specs(env)
+    assert set(env.reward_spec.keys()) == {"reward", "cost"}
+    assert env.reward_spec["cost"] == Unbounded((1,), dtype=torch.float32)
+    assert "cost" not in env.reset()
+    check_counts(env.rollout(10, break_when_any_done=False), [steps])
+
+
+@by_mode
+@pytest.mark.parametrize(
+    "kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")], ids=["sync", "async"]
+)
+def test_vectorized(make_env, mode, kind):
+    env = make_env(SafeGymWrapper, vector(mode, kind=kind))
+    check_env_specs(env)
+    assert env.reward_spec["cost"].shape == (2, 1)
+    assert "cost" not in env.reset()
+    # Rows end apart in most steps, and both at once in the twelfth.
+    check_counts(env.rollout(26, break_when_any_done=False), [4, 3])
+
+
+@by_mode
+def test_made_by_gymnasium(make_env, mode):
+    vectorized = gymnasium.make_vec(
+        "counting:Counting-v0",
+        num_envs=3,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": mode},
+        steps=2,
+    )
+    env = make_env(SafeGymWrapper, vectorized)
+    check_counts(env.rollout(5, break_when_any_done=False), [2, 2, 2])
+
+
+@pytest.fixture
+def forked_workers():
+    """TorchRL makes spawning the default, which takes seconds for each worker."""
+    before = multiprocessing.get_start_method()
+    multiprocessing.set_start_method("fork", force=True)
+    yield
+    multiprocessing.set_start_method(before, force=True)
+
+
+def test_made_by_name_and_vectorized(make_env, forked_workers):
+    """TorchRL's own GymEnv returns zeros for the last observations here."""
+    env = make_env(SafeGymEnv, "counting:Counting-v0", num_envs=2, steps=4)
+    check_counts(env.rollout(9, break_when_any_done=False), [4, 4])
+
+
+def test_default_autoreset_is_refused():
+    with pytest.raises(RuntimeError, match="SAME_STEP or DISABLED"):
+        SafeGymWrapper(vector(AutoresetMode.NEXT_STEP))
+
+
+@by_mode
+def test_resets_in_the_middle(make_env, mode):
+    env = make_env(SafeGymWrapper, vector(mode))
+    assert env.rollout(5)["next", "done"][:, -1].flatten().tolist() == [False, True]
+    assert env.reset()["observation"].flatten().tolist() == [0, 0]
+    last = env.rollout(5)[:, -1]
+    env.step(env.rand_action(env.reset()))
+    everything = last.empty().set("_reset", torch.ones(2, 1, dtype=torch.bool))
+    assert env.reset(everything)["observation"].flatten().tolist() == [0, 0]
+    # Also with a tensordict that has no mask.
+    assert env.reset(env.reset())["observation"].flatten().tolist() == [0, 0]
+    check_counts(env.rollout(7, break_when_any_done=False), [4, 3])
+
+
+def test_same_step_resets_only_what_is_done(make_env):
+    env = make_env(SafeGymWrapper, vector(AutoresetMode.SAME_STEP))
+    started = env.reset()
+    started["_reset"] = torch.tensor([[True], [False]])
+    with pytest.raises(RuntimeError, match="only environments that are done can be reset apart"):
+        env.reset(started)
+
+
+KEYS = [("costs", "count"), "cost", ("costs", "one")]
+
+
+@pytest.mark.parametrize("mode", [None, *MODES], ids=str)
+def test_several_costs(make_env, mode):
+    env = make_env(SafeGymWrapper, Counting(4) if mode is None else vector(mode), cost_keys=KEYS)
+    check_env_specs(env)
+    rollout = env.rollout(9, break_when_any_done=False)
+    check_counts(rollout.exclude(("next", "cost")).set(("next", "cost"), own(rollout)), row(mode))
+    count = rollout["next", "observation"]
+    expected = torch.cat([count, count / 4, torch.ones_like(count)], dim=-1)
+    assert torch.equal(rollout["next", "cost"], expected)
+
+
+def own(rollout):
+    return rollout["next", "cost"][..., 1:2]
+
+
+def row(mode):
+    return [4] if mode is None else [4, 3]
+
+
+class SixTupleVector(VectorEnv):
+    """Two rows that return the cost as Safety-Gymnasium's vector environments do."""
+
+    num_envs = 2
+    single_observation_space = Counting.observation_space
+    single_action_space = Counting.action_space
+    observation_space = batch_space(single_observation_space, 2)
+    action_space = batch_space(single_action_space, 2)
+
+    def __init__(self, mode):
+        self.inner = vector(mode)
+        self.autoreset_mode = mode
+        self.metadata = {"autoreset_mode": mode}
+
+    def reset(self, **kwargs):
+        return self.inner.reset(**kwargs)
+
+    def step(self, actions):
+        *outcome, terminated, truncated, info = self.inner.step(actions)
+        # The reward is ten times the count, the cost a quarter of it.
+        return *outcome, outcome[1] / 40, terminated, truncated, info
+
+
+@by_mode
+def test_six_tuples_of_a_vector(make_env, mode):
+    env = make_env(SafeGymWrapper, SixTupleVector(mode))
+    check_env_specs(env)
+    check_counts(env.rollout(13, break_when_any_done=False), [4, 3])
+
+
+@by_mode
+def test_named_observations(make_env, mode):
+    class Named(Counting):
+        observation_space = Dict(count=Counting.observation_space, pair=Box(0, 1000, (2,)))
+
+        def name(self, count, *others):
+            return {"count": count, "pair": count.repeat(2)}, *others
+
+        def reset(self, **kwargs):
+            return self.name(*super().reset(**kwargs))
+
+        def step(self, action):
+            return self.name(*super().step(action))
+
+    env = make_env(SafeGymWrapper, vector(mode, partial(Named, 4), partial(Named, 3)))
+    check_env_specs(env)
+    rollout = env.rollout(13, break_when_any_done=False)
+    for part in (rollout, rollout["next"]):
+        assert torch.equal(part["pair"], part["count"].expand(2, 13, 2))
+        part["observation"] = part["count"]
+    check_counts(rollout, [4, 3])
+
+
+def test_costs_of_skipped_frames_add_up(make_env):
+    env = make_env(SafeGymEnv, "counting:Counting-v0", steps=5, frame_skip=2)
+    rollout = env.rollout(3)
+    assert rollout["next", "reward"].flatten().tolist() == [10 + 20, 30 + 40, 50]
+    assert rollout["next", "cost"].flatten().tolist() == [0.25 + 0.5, 0.75 + 1, 1.25]
+
+
+def test_other_info_can_still_be_read(make_env):
+    class Flag(Counting):
+        def info(self):
+            return {**super().info(), "twice": np.float64(2 * self.count)}
+
+    single = make_env(SafeGymWrapper, Flag(4))
+    single.set_info_dict_reader(default_info_dict_reader(["twice"]))
+    assert single.rollout(4)["next", "twice"].flatten().tolist() == [2, 4, 6, 8]
+    same_step = make_env(SafeGymWrapper, vector(AutoresetMode.SAME_STEP, partial(Flag, 3), Flag))
+    # Nobody asked for it, so it is no observation.
+    assert list(same_step.observation_spec.keys()) == ["observation"]
+    reader = default_info_dict_reader(["twice"], spec=[Unbounded((2,), dtype=torch.float64)])
+    same_step.set_info_dict_reader(reader)
+    rollout = same_step.rollout(5, break_when_any_done=False)
+    assert rollout["next", "twice"].tolist() == [[2, 4, 6, 2, 4], [2, 4, 6, 8, 2]]
+
+
+def summed(env):
+    return env.append_transform(RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
+
+
+MAKERS = {
+    "single": partial(SafeGymEnv, "counting:Counting-v0"),
+    "serial": partial(SerialEnv, 2, partial(SafeGymEnv, "counting:Counting-v0")),
+    "parallel": partial(
+        ParallelEnv, 2, partial(SafeGymEnv, "counting:Counting-v0"), mp_start_method="fork"
+    ),
+    "same step": lambda: SafeGymWrapper(vector(MODES[0], Counting, Counting)),
+    "disabled": lambda: SafeGymWrapper(vector(MODES[1], Counting, Counting)),
+}
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
+def test_in_a_collector(make_env, make):
+    env = make_env(lambda: summed(make()))
+    rows = max(1, env.batch_size.numel())
+    collector = Collector(env, frames_per_batch=10 * rows, total_frames=20 * rows)
+    batches = list(collector)
+    collector.shutdown()
+    data = torch.cat(batches, dim=-1)
+    check_counts(data, [4] * rows)
+    done = data["next", "done"]
+    assert data["next", "episode_cost"][done].tolist() == [2.5] * 5 * rows
+    assert data["next", "episode_reward"][done].tolist() == [100] * 5 * rows
+
+
+def test_a_step_without_a_cost_raises(make_env):
+    env = make_env(SafeGymEnv, "counting:Forgetful-v0")
+    with pytest.raises(KeyError, match=r"info must have \('cost',\) in every step, got only \[\]"):
+        env.rollout(2)
+    nested = make_env(SafeGymWrapper, Counting(), cost_keys=[("costs", "heat")])
+    with pytest.raises(KeyError, match=r"info must have \('costs', 'heat'\) in every step"):
+        nested.rollout(1)
+    no_mapping = make_env(SafeGymWrapper, Counting(), cost_keys=[("cost", "heat")])
+    with pytest.raises(KeyError, match=r"info must have \('cost', 'heat'\) in every step"):
+        no_mapping.rollout(1)
+
+
+def test_entries_that_look_like_masks(make_env):
+    class Private(Counting):
+        def info(self):
+            return {**super().info(), "_cost": False}
+
+    check_counts(make_env(SafeGymWrapper, Private()).rollout(4), [4])
+
+
+@by_mode
+def test_a_row_without_a_cost_raises(make_env, mode):
+    env = make_env(SafeGymWrapper, vector(mode, Counting, Forgetful))
+    with pytest.raises(KeyError, match=r"\('cost',\) .* environments \[1\] have none"):
+        env.rollout(2)
+
+
+@pytest.mark.parametrize("steps", [2, 4], ids=["that ends", "beside one that ends"])
+def test_a_step_without_a_cost_raises_at_an_end(make_env, steps):
+    """The cost of the reset, which stands in its place, is not taken for it."""
+    rows = partial(Counting, 2), partial(Forgetful, steps)
+    env = make_env(SafeGymWrapper, vector(AutoresetMode.SAME_STEP, *rows))
+    with pytest.raises(KeyError, match=r"environments \[1\] have none"):
+        env.rollout(2)
+
+
+class Returns(Counting):
+    def __init__(self, value):
+        super().__init__()
+        self.value = value
+
+    def info(self):
+        return {"cost": self.value}
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), None])
+def test_cost_must_be_finite(make_env, value):
+    with pytest.raises(ValueError, match="cost 'cost' must be finite"):
+        make_env(SafeGymWrapper, Returns(value)).rollout(1)
+
+
+def test_cost_must_be_a_number(make_env):
+    with pytest.raises(ValueError, match=r"cost 'cost' must have shape \(\), got \(2,\)"):
+        make_env(SafeGymWrapper, Returns([1.0, 2.0])).rollout(1)
+
+
+@pytest.mark.parametrize("kind", [int, np.float32, bool, np.array])
+def test_kinds_of_numbers(make_env, kind):
+    env = make_env(SafeGymWrapper, Returns(kind(1)))
+    assert env.rollout(2)["next", "cost"].tolist() == [[1.0], [1.0]]
+
+
+@pytest.mark.parametrize("keys", ["cost", []], ids=repr)
+def test_wrong_keys(keys):
+    with pytest.raises(ValueError, match="cost_keys must be a sequence of at least one key"):
+        SafeGymWrapper(Counting(), cost_keys=keys)
+
+
+def test_device_is_that_of_the_tensors(make_env):
+    env = make_env(SafeGymWrapper, Counting(), device="cpu")
+    assert env.rollout(2)["next", "cost"].device == torch.device("cpu")
