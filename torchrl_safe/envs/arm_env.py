@@ -33,7 +33,7 @@ Cost = Callable[[ArmState], Array]
 
 # Episodes that are tried when an environment is made; how near, in m, counts as reached there;
 # and how often obstacles are drawn until they leave the arm free.
-_CHECKED_STARTS, _REACHED, _ATTEMPTS = 100, 0.02, 100
+_CHECKED_STARTS, _REACHED, _ATTEMPTS = 50, 0.02, 100
 
 
 class ArmEnv(EnvBase):

@@ -155,13 +155,13 @@ class World:
         self._goal = goal.tolist()
         self._present = np.flatnonzero(placement.present).tolist()
         self._placement, self._substeps = placement, 0
-        positions, orientations = self._look_ahead(1)
-        self._follow(positions, orientations, 0)
-        for index, body in enumerate(self._obstacles):
-            if index not in self._present:
-                self._poses[index] = (_limbo(index), _UPRIGHT)
-                self._velocities[index] = (_AT_REST, _AT_REST)
+        poses = zip(placement.position.tolist(), placement.orientation.tolist(), strict=True)
+        for index, (body, pose) in enumerate(zip(self._obstacles, poses, strict=True)):
+            self._poses[index] = pose if index in self._present else (_limbo(index), _UPRIGHT)
+            self._velocities[index] = (_AT_REST, _AT_REST)
             self._place(body, *self._poses[index])
+        if placement.path is not None:
+            self._follow(*self._look_ahead(1), substep=0)
         for body, place in zip(self._objects, objects.tolist(), strict=True):
             self._place(body, place)
         for target in (self._brick, self._marker):

@@ -227,12 +227,12 @@ def _apart(
     rng: np.random.Generator, region: Region, distance: float, shape: Shape
 ) -> tuple[Array, Array]:
     """Draws a goal and an object on the table, at least some distance apart."""
-    height = shape.half_extents[2]
-    for _ in range(_ATTEMPTS):
-        goal, place = region.sample(rng), region.sample(rng)
-        goal[2] = place[2] = height
-        if np.linalg.norm(goal - place) >= distance:
-            return goal, place[None]
+    pairs = rng.uniform(region.low, region.high, (_ATTEMPTS, 2, 3))
+    pairs[:, :, 2] = shape.half_extents[2]
+    apart = np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1) >= distance
+    if apart.any():
+        goal, place = pairs[apart.argmax()]
+        return goal, place[None]
     raise ValueError(
         f"region must be wide enough for goals at a distance of {distance} m, got {region}."
     )
