@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow lint format type clean
+.PHONY: train test test-slow gallery lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -15,6 +15,9 @@ test: $(READY)  ## everything but the slow tests
 
 test-slow: $(READY)  ## the tests that train for minutes
 	$(BIN)/pytest -m slow $(ARGS)
+
+gallery: $(READY)  ## the contact sheet of docs/environments.md
+	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

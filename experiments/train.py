@@ -33,10 +33,35 @@ from tqdm import tqdm
 
 from experiments.evaluation import evaluate, summarize
 from experiments.report import plot_curves, save_animation, save_picture, table
-from torchrl_safe.envs import PANDA, ActionMode, ArmEnv, CartesianDelta, Collision, JointDelta
+from torchrl_safe.envs import (
+    IIWA,
+    PANDA,
+    UR5,
+    UR10,
+    XARM6,
+    XARM7,
+    ActionMode,
+    ArmEnv,
+    CartesianDelta,
+    Collision,
+    Human,
+    InFront,
+    JointDelta,
+    Moving,
+    NoObstacles,
+    Obstacles,
+    Scattered,
+)
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
 
-ARMS = {"panda": PANDA}
+ARMS = {"panda": PANDA, "iiwa": IIWA, "xarm6": XARM6, "xarm7": XARM7, "ur5": UR5, "ur10": UR10}
+OBSTACLES: dict[str, Obstacles] = {
+    "none": NoObstacles(),
+    "in-front": InFront(),
+    "scattered": Scattered(),
+    "moving": Moving(),
+    "human": Human(),
+}
 ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointDelta()}
 COSTS = {"collision": Collision()}
 
@@ -45,8 +70,10 @@ COSTS = {"collision": Collision()}
 class Config:
     """Train PPO and PPO-Lagrangian on a robot arm and compare them."""
 
-    arm: Literal["panda"] = "panda"
+    arm: Literal["panda", "iiwa", "xarm6", "xarm7", "ur5", "ur10"] = "panda"
     """Robot arm."""
+    obstacles: Literal["none", "in-front", "scattered", "moving", "human"] = "in-front"
+    """What is in the way."""
     action: Literal["cartesian", "joint"] = "cartesian"
     """What an action moves: the tool point, by inverse kinematics, or each joint."""
     algorithms: tuple[Literal["ppo", "ppo-lagrangian"], ...] = ("ppo", "ppo-lagrangian")
@@ -112,6 +139,7 @@ def make_env(config: Config, num_envs: int, seed: int | None = None) -> EnvBase:
     env = ArmEnv(
         ARMS[config.arm],
         action=ACTIONS[config.action],
+        obstacles=OBSTACLES[config.obstacles],
         costs=COSTS,
         num_envs=num_envs,
         seed=seed,

@@ -9,7 +9,7 @@ import numpy as np
 from torchrl_safe.envs.checks import check_array, check_positive
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.rotations import from_z_axis
-from torchrl_safe.envs.shapes import Capsule, Shape
+from torchrl_safe.envs.shapes import Capsule, Shape, Sphere
 from torchrl_safe.envs.state import Array
 
 # Reaches before the motion repeats itself: more than the usual episode has time for.
@@ -23,7 +23,7 @@ _NEAREST, _REACH = 0.12, 0.62
 
 @dataclass(frozen=True)
 class Human:
-    """A person opposite the arm: upper arm, forearm with the hand, and head, as capsules.
+    """A person opposite the arm: capsules for upper arm and forearm with the hand, and a head.
 
     The hand waits beside the shoulder, reaches for a point on the way from start to goal, rests
     there for a while, goes back and begins again with another point. It moves along straight
@@ -47,7 +47,7 @@ class Human:
     Examples:
         >>> placement = Human().sample(np.random.default_rng(0), np.zeros(3), np.ones(3))
         >>> [type(shape).__name__ for shape in Human().shapes], placement.position.shape
-        (['Capsule', 'Capsule', 'Capsule'], (3, 3))
+        (['Capsule', 'Capsule', 'Sphere'], (3, 3))
     """
 
     shoulder: tuple[float, float, float] = (1.1, 0.2, 0.4)
@@ -75,7 +75,7 @@ class Human:
         return (
             Capsule(radius=0.05, length=_UPPER_ARM),
             Capsule(radius=0.045, length=_FOREARM),
-            Capsule(radius=0.09, length=0.06),
+            Sphere(radius=0.1),
         )
 
     def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:

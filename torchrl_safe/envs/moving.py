@@ -14,21 +14,26 @@ from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import Array
 
 
-def _check_direction(direction: tuple[float, float, float]) -> None:
-    if not check_array("direction", direction, (3,)).any():
+def _check_direction(direction: tuple[float, float, float] | None) -> None:
+    if direction is not None and not check_array("direction", direction, (3,)).any():
         raise ValueError(f"direction must not be zero, got {direction}.")
 
 
-def _unit(direction: tuple[float, float, float]) -> Array:
-    return np.array(direction) / np.linalg.norm(direction)
+def _unit(direction: tuple[float, float, float] | None, across: Array) -> Array:
+    return across if direction is None else np.array(direction) / np.linalg.norm(direction)
 
 
 @runtime_checkable
 class Motion(Protocol):
     """What :class:`Moving` asks of a motion."""
 
-    def sample(self, rng: np.random.Generator) -> Callable[[Array], Array]:
-        """Draws one obstacle's motion: maps times, s, ``(s,)``, to displacements, m, ``(s, 3)``."""
+    def sample(self, rng: np.random.Generator, across: Array) -> Callable[[Array], Array]:
+        """Draws one obstacle's motion: maps times, s, ``(s,)``, to displacements, m, ``(s, 3)``.
+
+        Args:
+            rng: the generator of the world.
+            across: horizontal unit vector across the way from start to goal, ``(3,)``.
+        """
 
 
 @dataclass(frozen=True)
@@ -38,27 +43,29 @@ class Swing:
     Args:
         amplitude: a, m, to each side.
         period: T, s. The largest speed is :math:`2 \pi a / T`.
-        direction: of the motion; its length does not matter.
+        direction: of the motion; its length does not matter. ``None`` takes the horizontal
+            across the way from start to goal.
 
     Raises:
         ValueError: if an argument is not positive or ``direction`` is zero.
 
     Examples:
-        >>> displacement = Swing(amplitude=0.1, period=2.0).sample(np.random.default_rng(0))
+        >>> rng, across = np.random.default_rng(0), np.array([0.0, 1.0, 0.0])
+        >>> displacement = Swing(amplitude=0.1, period=2.0).sample(rng, across)
         >>> displacement(np.array([0.0, 1.0, 2.0])).shape
         (3, 3)
     """
 
     amplitude: float = 0.1
     period: float = 2.0
-    direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    direction: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         check_positive(amplitude=self.amplitude, period=self.period)
         _check_direction(self.direction)
 
-    def sample(self, rng: np.random.Generator) -> Callable[[Array], Array]:
-        phase, along = rng.uniform(0, 2 * np.pi), _unit(self.direction)
+    def sample(self, rng: np.random.Generator, across: Array) -> Callable[[Array], Array]:
+        phase, along = rng.uniform(0, 2 * np.pi), _unit(self.direction, across)
 
         def displacement(times: Array) -> Array:
             swing = np.sin(2 * np.pi * times / self.period + phase)
@@ -74,27 +81,29 @@ class Patrol:
     Args:
         distance: length of the way, m; its middle is where the layout puts the obstacle.
         speed: m/s.
-        direction: of the way; its length does not matter.
+        direction: of the way; its length does not matter. ``None`` takes the horizontal across
+            the way from start to goal.
 
     Raises:
         ValueError: if an argument is not positive or ``direction`` is zero.
 
     Examples:
-        >>> displacement = Patrol(distance=0.2, speed=0.1).sample(np.random.default_rng(0))
+        >>> rng, across = np.random.default_rng(0), np.array([0.0, 1.0, 0.0])
+        >>> displacement = Patrol(distance=0.2, speed=0.1).sample(rng, across)
         >>> bool((abs(displacement(np.linspace(0, 9, 50))) <= 0.1 + 1e-12).all())
         True
     """
 
     distance: float = 0.3
     speed: float = 0.2
-    direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    direction: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         check_positive(distance=self.distance, speed=self.speed)
         _check_direction(self.direction)
 
-    def sample(self, rng: np.random.Generator) -> Callable[[Array], Array]:
-        begin, along = rng.uniform(0, 2 * self.distance), _unit(self.direction)
+    def sample(self, rng: np.random.Generator, across: Array) -> Callable[[Array], Array]:
+        begin, along = rng.uniform(0, 2 * self.distance), _unit(self.direction, across)
 
         def displacement(times: Array) -> Array:
             way = (begin + self.speed * times) % (2 * self.distance)
@@ -139,7 +148,11 @@ class Moving:
 
     def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
         base = self.layout.sample(rng, start, goal)
-        displacements = [self.motion.sample(rng) for _ in self.shapes]
+        way = goal - start
+        # Straight up there is no across.
+        across = np.array([-way[1], way[0], 0.0]) if way[:2].any() else np.array([0.0, 1.0, 0.0])
+        across /= np.linalg.norm(across)
+        displacements = [self.motion.sample(rng, across) for _ in self.shapes]
 
         def path(times: Array) -> tuple[Array, Array]:
             positions, orientations = base.at(times)
