@@ -161,34 +161,40 @@ class World:
             self._velocities[index] = (_AT_REST, _AT_REST)
             self._place(body, *self._poses[index])
         if placement.path is not None:
-            self._follow(*self._look_ahead(1), substep=0)
+            self._follow(*self._look_ahead(1)[0])
         for body, place in zip(self._objects, objects.tolist(), strict=True):
             self._place(body, place)
         for target in (self._brick, self._marker):
             if target is not None:
                 self._place(target, self._goal)
 
-    def _look_ahead(self, substeps: int) -> tuple[Array, Array]:
-        """Poses of the obstacles from now until after some substeps, one more than these."""
-        times = SUBSTEP * np.arange(self._substeps, self._substeps + substeps + 1, dtype=float)
-        return self._placement.at(times)
+    def _look_ahead(self, substeps: int) -> list[tuple[list[_Vector], ...]]:
+        """The obstacles' ways through the next substeps.
 
-    def _follow(self, positions: Array, orientations: Array, substep: int) -> None:
-        """Takes the obstacles' poses and velocities of one of the substeps ahead."""
-        now, later = max(substep - 1, 0), max(substep, 1)
-        linear = (positions[later] - positions[now]) / SUBSTEP
-        angular = rotation_vector(orientations[now], orientations[later]) / SUBSTEP
-        rows = zip(
-            positions[substep].tolist(),
-            orientations[substep].tolist(),
-            linear.tolist(),
-            angular.tolist(),
-            strict=True,
-        )
-        for index, (position, orientation, velocity, spin) in enumerate(rows):
-            if index in self._present:
-                self._poses[index] = (position, orientation)
-                self._velocities[index] = (velocity, spin)
+        Returns:
+            For now and after each substep the positions, orientations, velocities and angular
+            velocities of all obstacles.
+        """
+        times = SUBSTEP * np.arange(self._substeps, self._substeps + substeps + 1, dtype=float)
+        positions, orientations = self._placement.at(times)
+        velocities = np.diff(positions, axis=0) / SUBSTEP
+        spins = rotation_vector(orientations[:-1], orientations[1:]) / SUBSTEP
+        # Those of now are those of the first substep.
+        moves = [np.concatenate([part[:1], part]).tolist() for part in (velocities, spins)]
+        return list(zip(positions.tolist(), orientations.tolist(), *moves, strict=True))
+
+    def _follow(
+        self,
+        positions: list[_Vector],
+        orientations: list[_Vector],
+        velocities: list[_Vector],
+        spins: list[_Vector],
+    ) -> None:
+        """Puts the obstacles where their ways lead."""
+        for index in self._present:
+            self._poses[index] = (positions[index], orientations[index])
+            self._velocities[index] = (velocities[index], spins[index])
+            self._place(self._obstacles[index], *self._poses[index])
 
     def advance(
         self, joint_target: _Vector, finger_target: _Vector, substeps: int
@@ -205,14 +211,11 @@ class World:
         distances = [math.inf] * len(self._obstacles)
         forces = [0.0] * len(self._obstacles)
         measurements = []
-        moves = self._placement.path is not None
-        ahead = self._look_ahead(substeps) if moves else None
+        ways = None if self._placement.path is None else self._look_ahead(substeps)
         senses = self._sensing != Sensing()
-        for substep in range(1, substeps + 1):
-            if ahead is not None:
-                self._follow(*ahead, substep)
-                for index in self._present:
-                    self._place(self._obstacles[index], *self._poses[index])
+        for substep in range(substeps):
+            if ways is not None:
+                self._follow(*ways[substep + 1])
             pybullet.stepSimulation(physicsClientId=client)
             for index in self._present:
                 points = pybullet.getContactPoints(
