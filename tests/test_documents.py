@@ -18,13 +18,13 @@ def run(path):
     return done.stdout
 
 
-def readme_code():
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    return re.findall(r"```python\n(.*?)```", readme, re.S)
+def code_of(document):
+    text = (ROOT / document).read_text(encoding="utf-8")
+    return re.findall(r"```python\n(.*?)```", text, re.S)
 
 
 def test_readme_loop(tmp_path):
-    code = readme_code()[0]
+    code = code_of("README.md")[0]
     assert len(code.splitlines()) <= 40
     # The same program on fewer frames.
     short = code.replace("total_frames=256_000", "total_frames=6_144")
@@ -42,11 +42,21 @@ def test_readme_loop(tmp_path):
 
 
 def test_readme_recipes(tmp_path):
-    arm, cost, rule = readme_code()[1:]
+    arm, cost, rule = code_of("README.md")[1:]
     check = "print(env.rollout(3)['next', 'cost'].shape[-1])\n"
     script = tmp_path / "recipes.py"
     script.write_text("\n".join([arm, check, cost, check, rule]), encoding="utf-8")
     assert run(script).split() == ["1", "2"]
+
+
+def test_environments(tmp_path):
+    """Each block runs by itself, and each environment in it is one."""
+    blocks = code_of("docs/environments.md")
+    assert len(blocks) == 5
+    script = tmp_path / "environments.py"
+    check = "env.reset()\nenv.close()\n"
+    script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")
+    run(script)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda p: p.stem)
