@@ -21,6 +21,8 @@ CAMERA = Camera(eye=(0.75, -1.5, 0.9), target=(0.5, 0.0, 0.24), field_of_view=44
 class Config:
     """Draw a contact sheet of every arm, task and layout of obstacles."""
 
+    arms: tuple[str, ...] = tuple(ARMS)
+    """Which arms, by their names in torchrl_safe.envs.gym.ARMS."""
     out: Path = Path("runs/gallery.png")
     """File of the picture."""
     width: int = 200
@@ -37,11 +39,12 @@ def main(config: Config) -> None:
     height = config.width * 3 // 4
     figure, grid = plt.subplots(
         len(rows),
-        len(ARMS),
-        figsize=(len(ARMS) * config.width / 100, len(rows) * height / 100),
+        len(config.arms),
+        figsize=(len(config.arms) * config.width / 100, len(rows) * height / 100),
+        squeeze=False,
         gridspec_kw={"wspace": 0.02, "hspace": 0.02},
     )
-    tiles = list(product(enumerate(rows), enumerate(ARMS)))
+    tiles = list(product(enumerate(rows), enumerate(config.arms)))
     for (row, (task, obstacles)), (column, arm) in tqdm(tiles, desc="gallery", unit="tile"):
         axis = grid[row][column]
         env = ArmEnv(**combination(arm, task, obstacles, ""), seed=config.seed)

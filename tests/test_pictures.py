@@ -1,0 +1,31 @@
+"""Films and the contact sheet."""
+
+import torch
+from PIL import Image
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.record import PixelRenderTransform, VideoRecorder
+from torchrl.record.loggers import CSVLogger
+
+from experiments.gallery import Config, main
+from torchrl_safe.envs import ArmEnv, Human
+
+
+def test_torchrl_films(make_env, tmp_path):
+    recorder = VideoRecorder(CSVLogger("run", str(tmp_path), video_format="pt"), "film", skip=1)
+    transforms = Compose(PixelRenderTransform(width=32, height=24), recorder)
+    env = make_env(lambda: TransformedEnv(ArmEnv(obstacles=Human(), seed=0), transforms))
+    pixels = env.rollout(5)["next", "pixels"]
+    recorder.dump()
+    (path,) = tmp_path.rglob("*.pt")
+    film = torch.load(path)
+    # One picture at the reset and one for each step, with the channels first.
+    assert film.shape == (1, 6, 3, 24, 32)
+    assert torch.equal(film[0, 1:], pixels[0].permute(0, 3, 1, 2))
+    assert not torch.equal(film[0, 1], film[0, 5])
+
+
+def test_contact_sheet(tmp_path):
+    main(Config(arms=("Panda",), out=tmp_path / "new" / "sheet.png", width=40, steps=1))
+    with Image.open(tmp_path / "new" / "sheet.png") as sheet:
+        assert sheet.height > 0.9 * 15 * 30, "a row for each of 15 tasks and layouts"
+        assert len(set(sheet.convert("RGB").getdata())) > 1000
