@@ -1,16 +1,28 @@
 """Policies without learning, which show what a task costs and that it can be done for nothing.
 
-A pilot is a generator for one world: it is sent the state after each step, and yields where the
+A pilot is a generator for one world: it looks at the environment's state, and yields where the
 tool is to go next, m, and how far the fingers are to open (1) or close (0).
 """
+
+import math
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-# Higher than the obstacles by more than what is held.
-SAFE_HEIGHT = 0.33
-ON_TABLE = 0.02
+from torchrl_safe.envs import IIWA, PANDA, UR5, UR10, XARM6, XARM7
+
+# Higher than the obstacles by more than what is held; and where the fingers' ends, 1 cm below
+# the tool point, take the upper half of a cube: the lower the hand, the nearer an obstacle is to
+# the forearm above.
+SAFE_HEIGHT, LOW = 0.33, 0.033
+
+# Orientations of the tool that keep the arm off an obstacle beside the object. Turned by a
+# quarter, the hand shows it its narrow side; to which side, decides where the elbow of an arm
+# with seven joints goes. The wrist of a UR hangs too low for that: leaning, it stays back.
+LEFT, RIGHT = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0), (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
+LEANING = (0.0, math.cos(0.3), 0.0, math.sin(0.3))
+HOLD = {PANDA: RIGHT, IIWA: RIGHT, XARM6: RIGHT, XARM7: LEFT, UR5: LEANING, UR10: LEANING}
 
 
 def fly(env, pilot, steps=None):
@@ -57,59 +69,84 @@ def straight(env, row):
 
 def over(env, row):
     """To the goal over all obstacles."""
-    yield from _rise(env, row)
-    yield from _go(env, row, _at_height(env.arm_state.goal[row], SAFE_HEIGHT))
+    yield from rise(env, row)
+    yield from go(env, row, _at_height(env.arm_state.goal[row], SAFE_HEIGHT))
     yield from straight(env, row)
 
 
 def carry(env, row, height=SAFE_HEIGHT):
     """Picks the object up, carries it at a height and sets it down at the goal."""
-    place, goal = env.arm_state.object_position[row, 0], _away_from_obstacles(env, row)
-    yield from _rise(env, row, opening=1.0)
-    yield from _go(env, row, _at_height(place, SAFE_HEIGHT), opening=1.0)
-    yield from _go(env, row, place, opening=1.0, tolerance=0.01, stride=0.03)
-    for _ in range(10):
-        yield place, 0.0
-    yield from _go(env, row, _at_height(place, height), stride=0.03)
-    yield from _go(env, row, _at_height(goal, height), stride=0.03)
+    goal = _away_from_obstacles(env, row)
     while True:
-        yield _toward(env, row, goal, 0.03), 0.0
+        place = env.arm_state.object_position[row, 0]
+        yield from pick(env, row)
+        for stop in (_at_height(place, height), _at_height(goal, height), goal):
+            while distance(env, row, stop) > 0.02 and _holds(env, row):
+                yield stop, 0.0
 
 
-def push(env, row, around=True):
-    """Pushes the object to the goal, around what stands in between or straight at it."""
-    goal = _away_from_obstacles(env, row) if around else env.arm_state.goal[row]
-    for stop in _detour(env, row, goal) if around else [goal]:
-        while np.linalg.norm(env.arm_state.object_position[row, 0] - stop) > 0.02:
-            yield from _push_towards(env, row, stop)
-    yield from _rise(env, row)
+def carry_low(env, row):
+    """The same, without regard for obstacles."""
+    yield from carry(env, row, height=0.1)
 
 
-def _push_towards(env, row, stop):
-    """One push, for as long as the object stays before the tool."""
-    here = env.arm_state.object_position[row, 0]
-    behind = here - 0.07 * _unit(stop - here)
-    yield from _rise(env, row)
-    yield from _go(env, row, _at_height(behind, SAFE_HEIGHT), tolerance=0.02)
-    yield from _go(env, row, _at_height(behind, ON_TABLE), tolerance=0.01)
-    for _ in range(60):
-        here, tool = env.arm_state.object_position[row, 0], env.arm_state.ee_position[row]
-        direction = _unit(stop - here)
-        aside = (here - tool) - ((here - tool) @ direction) * direction
-        aside[2] = 0
-        if np.linalg.norm(stop - here) < 0.02 or np.linalg.norm(aside) > 0.025:
-            return
-        yield _toward(env, row, _at_height(here + aside, ON_TABLE), 0.02), 0.0
+def pick(env, row):
+    """Closes the fingers around the object."""
+    place = env.arm_state.object_position[row, 0]
+    yield from rise(env, row, opening=1.0)
+    yield from go(env, row, _at_height(place, SAFE_HEIGHT), opening=1.0, tolerance=0.01)
+    yield from go(env, row, _at_height(place, LOW), opening=1.0, tolerance=0.005)
+    for _ in range(5):
+        yield _at_height(place, LOW), 0.0
 
 
-def _detour(env, row, goal):
-    """Where to push the object, one stop after the other, towards the base first."""
-    here = env.arm_state.object_position[row, 0]
-    if not env.arm_state.obstacle_present[row].any():
-        return [goal]
-    aside = np.cross(_unit(goal - here), (0.0, 0.0, 1.0))
-    aside *= -0.2 * np.sign(aside[0])
-    return [here + aside, goal + aside, goal]
+def push_around(env, row):
+    """Pushes the object to the goal by way of the base, where no obstacle is."""
+    here, goal = env.arm_state.object_position[row, 0], _away_from_obstacles(env, row)
+    near = min(here[0], goal[0]) - 0.15
+    # The tool is behind what it pushes: off the straight way, farther from the obstacle.
+    aside = np.array([0, 0.08 * np.sign(goal[1] - here[1]), 0])
+    stops = [here + aside, goal - aside]
+    for stop in [*(np.array([near, *stop[1:]]) for stop in stops), goal]:
+        yield from _push_to(env, row, stop)
+
+
+def push_straight(env, row):
+    """Pushes the object straight at the goal."""
+    yield from _push_to(env, row, env.arm_state.goal[row])
+
+
+def rise(env, row, opening=0.0):
+    """Straight up."""
+    yield from go(env, row, _at_height(env.arm_state.ee_position[row], SAFE_HEIGHT), opening)
+
+
+def go(env, row, point, opening=0.0, tolerance=0.03):
+    """Straight to a point."""
+    while distance(env, row, point) > tolerance:
+        yield point, opening
+
+
+def distance(env, row, point):
+    """From the tool point, m."""
+    return np.linalg.norm(point - env.arm_state.ee_position[row])
+
+
+def _push_to(env, row, stop):
+    """One push after the other, each for as long as the object stays before the tool."""
+    while np.linalg.norm(stop - env.arm_state.object_position[row, 0]) > 0.02:
+        here = env.arm_state.object_position[row, 0]
+        behind = here - 0.05 * _unit(stop - here)
+        yield from rise(env, row)
+        yield from go(env, row, _at_height(behind, SAFE_HEIGHT), tolerance=0.02)
+        yield from go(env, row, _at_height(behind, LOW), tolerance=0.005)
+        aside = np.zeros(3)
+        while np.linalg.norm(stop - here) > 0.02 and np.linalg.norm(aside) < 0.025:
+            here, tool = env.arm_state.object_position[row, 0], env.arm_state.ee_position[row]
+            forward = _unit(_at_height(stop - here, 0))
+            aside = _at_height(here - tool, 0) @ (np.eye(3) - np.outer(forward, forward))
+            # It is pushed back to the line by pushing where it has gone.
+            yield _at_height(tool + 0.02 * forward + 0.25 * aside, LOW), 0.0
 
 
 def _away_from_obstacles(env, row):
@@ -120,18 +157,8 @@ def _away_from_obstacles(env, row):
     return goal + 0.03 * _unit(_at_height(away, 0)) if present.any() else goal
 
 
-def _rise(env, row, opening=0.0):
-    yield from _go(env, row, _at_height(env.arm_state.ee_position[row], SAFE_HEIGHT), opening)
-
-
-def _go(env, row, point, opening=0.0, tolerance=0.03, stride=1.0):
-    while np.linalg.norm(point - env.arm_state.ee_position[row]) > tolerance:
-        yield _toward(env, row, point, stride), opening
-
-
-def _toward(env, row, point, stride):
-    here = env.arm_state.ee_position[row]
-    return here + (point - here) * min(1.0, stride / max(np.linalg.norm(point - here), 1e-9))
+def _holds(env, row):
+    return distance(env, row, env.arm_state.object_position[row, 0]) < 0.04
 
 
 def _at_height(point, height):

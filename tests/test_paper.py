@@ -10,7 +10,7 @@ import numpy as np
 import pybullet
 import pytest
 import torch
-from scripted import fly
+from scripted import fly, go, straight
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -142,7 +142,7 @@ def test_reward_is_the_l1_distance(make_env):
 def test_straight_policy_scores_as_in_the_original(make_env):
     """Measured there, 50 episodes: success 1.00, return -21.6 +- 6.6, cost 28.6 +- 15.1."""
     env = make_env(paper_env, num_envs=50, seed=1)
-    success, total, cost = fly(env, lambda state: state.goal[None])
+    success, total, cost = fly(env, straight)
     assert success.all()
     standard_error = math.sqrt(1 / 50 + 1 / 50)
     assert total.mean() == pytest.approx(-21.6, abs=3 * 6.6 * standard_error)
@@ -153,11 +153,12 @@ def test_going_around_costs_nothing(make_env):
     """Measured there: 22 cm sideways, then in, reaches every target at cost 0."""
     env = make_env(paper_env, num_envs=20, seed=2)
 
-    def around(state):
-        side = state.goal + np.where(state.goal[:, 1:2] > 0, -1, 1) * [[0, 0.22, 0]]
-        above = side.copy()
-        above[:, 0], above[:, 2] = 0.43, 0.25
-        return np.stack([above, side + np.array([0, 0, 0.12]), state.goal])
+    def around(env, row):
+        goal = env.arm_state.goal[row]
+        side = goal + [0, -0.22 if goal[1] > 0 else 0.22, 0.12]
+        yield from go(env, row, np.array([0.43, side[1], 0.25]))
+        yield from go(env, row, side)
+        yield from straight(env, row)
 
     success, _, cost = fly(env, around)
     assert success.all()

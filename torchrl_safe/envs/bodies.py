@@ -20,6 +20,8 @@ from torchrl_safe.envs.urdf import prepare_urdf
 
 _WOOD = (0.72, 0.58, 0.42, 1.0)
 _UNLIMITED_EFFORT = 1e5
+# More than the fingers' motors can do, N.
+_GEAR_FORCE = 1e3
 _DATA = Path(pybullet_data.getDataPath())
 
 
@@ -85,7 +87,32 @@ def load_arm(
             f"home must be within the joint limits {loaded.joint_lower.tolist()} and "
             f"{loaded.joint_upper.tolist()}, got {arm.home}."
         )
+    if scene.motor_limits:
+        _couple(client, body, loaded.fingers)
     return loaded
+
+
+def _couple(client: int, body: int, fingers: Sequence[int]) -> None:
+    """Makes the fingers open alike, as the gear of a parallel gripper does.
+
+    Else equal efforts from both sides of what is held cancel, and it slides with both fingers
+    towards either of them as soon as the hand moves.
+    """
+    for finger in fingers[1:]:
+        gear = pybullet.createConstraint(
+            body,
+            fingers[0],
+            body,
+            finger,
+            jointType=pybullet.JOINT_GEAR,
+            jointAxis=(1, 0, 0),
+            parentFramePosition=(0, 0, 0),
+            childFramePosition=(0, 0, 0),
+            physicsClientId=client,
+        )
+        pybullet.changeConstraint(
+            gear, gearRatio=-1, erp=0.1, maxForce=_GEAR_FORCE, physicsClientId=client
+        )
 
 
 def _find_joints(client: int, body: int, chain: set[str], tool_link: str) -> LoadedArm:

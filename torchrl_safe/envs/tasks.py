@@ -145,10 +145,12 @@ class Push:
 class PickAndPlace:
     """Grasp a cube and bring it to a goal, in the air or on the table.
 
-    Reward, success within 0.05 m, the cube and the share of goals on the table are those of
-    panda-gym's PandaPickAndPlace (Gallouédec et al. 2021, arXiv 2106.13687); success ends the
-    episode (``terminated``). As in :class:`Push`, the cube never starts near its goal. The action
-    must move the fingers: ``CartesianDelta(finger_step=0.04)``.
+    Reward, success within 0.05 m, the size of the cube and the share of goals on the table are
+    those of panda-gym's PandaPickAndPlace (Gallouédec et al. 2021, arXiv 2106.13687); success
+    ends the episode (``terminated``). As in :class:`Push`, the cube never starts near its goal.
+    It weighs 0.1 kg instead of 1 kg: panda-gym's fingers press with 170 N, a Panda's URDF allows
+    20 N, from which 1 kg slips whenever the arm starts to move fast. The action must move the
+    fingers: ``CartesianDelta(finger_step=0.04)``.
 
     Args:
         region: where the goal is drawn, uniformly, and the cube below. ``None`` takes the arm's
@@ -166,14 +168,14 @@ class PickAndPlace:
 
     Examples:
         >>> PickAndPlace(on_table=0.0).objects
-        (Box(half_extents=(0.02, 0.02, 0.02), mass=1.0),)
+        (Box(half_extents=(0.02, 0.02, 0.02), mass=0.1),)
     """
 
     region: Region | None = None
     radius: float = 0.05
     distance: float = 0.3
     on_table: float = 0.3
-    shape: Shape = Box((0.02, 0.02, 0.02), mass=1.0)
+    shape: Shape = Box((0.02, 0.02, 0.02), mass=0.1)
     sparse: bool = False
 
     def __post_init__(self) -> None:
