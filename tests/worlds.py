@@ -1,4 +1,4 @@
-"""Worlds for the tests that need the simulator: steps, layouts, and an arm simple enough to compute.
+"""For the tests that need the simulator: steps, layouts, and an arm that is simple to compute.
 
 The turntable is a bar that turns about a vertical axis: 1 m long, 0.1 m wide, 0.04 m thick, its
 middle at (0, 0, 0.5) m. Its tool point is the end that points along x at home.
@@ -53,10 +53,9 @@ _TURNTABLE = """
 """
 
 
-@pytest.fixture
-def turntable(tmp_path):
+def turntable_settings(folder):
     """Settings of an ArmEnv with a turntable, which draws goals where the tool is."""
-    file = tmp_path / "turntable.urdf"
+    file = folder / "turntable.urdf"
     file.write_text(_TURNTABLE)
     arm = ArmModel(str(file), "tool", home=(0.0,), goals=Region((0.5, 0, 0.5), (0.5, 0, 0.5)))
     return {
@@ -109,3 +108,10 @@ def turn_back(orientation, vector):
 def turn(orientation, vector):
     """Vectors turned by quaternions (x, y, z, w)."""
     return turn_back(np.asarray(orientation) * (-1, -1, -1, 1), vector)
+
+
+def home_of(arm):
+    """The tool point at home, m."""
+    x = {"panda": 0.35, "iiwa": 0.42, "xarm6": 0.25, "xarm7": 0.25, "ur5": 0.35, "ur10": 0.35}
+    name = next(name for name, each in ARMS.items() if each is arm)
+    return np.array([x[name], 0.0, 0.25 if name == "iiwa" else 0.2])

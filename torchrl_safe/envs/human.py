@@ -28,8 +28,9 @@ class Human:
     The hand waits beside the shoulder, reaches for a point on the way from start to goal, rests
     there for a while, goes back and begins again with another point. It moves along straight
     lines with the minimum-jerk profile of human reaching (Flash & Hogan 1985, J. Neurosci. 5(7));
-    the elbow hangs down, away from the robot. Lengths are those of an average adult (upper arm 0.28 m, forearm and
-    fist 0.35 m; Winter 2009, Biomechanics and Motor Control of Human Movement).
+    the elbow hangs down and away from the robot. Lengths are those of an average adult (upper arm
+    0.28 m, forearm and fist 0.35 m; Winter 2009, Biomechanics and Motor Control of Human
+    Movement).
 
     The person does not yield: it follows its way whatever it hits.
 
