@@ -1,6 +1,7 @@
 """Fixtures shared by the tests."""
 
 import pytest
+from worlds import turntable_settings
 
 
 @pytest.fixture
@@ -17,3 +18,9 @@ def make_env():
     for env in made:
         if not env.is_closed:
             env.close()
+
+
+@pytest.fixture
+def turntable(tmp_path):
+    """Settings of an ArmEnv with a bar that turns about a vertical axis."""
+    return turntable_settings(tmp_path)

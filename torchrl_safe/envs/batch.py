@@ -67,7 +67,7 @@ class WorldBatch:
         world = self.worlds[row]
         world.reset(placement, goal, objects)
         self._rows[row] = world.read(fresh=True)
-        self._measured[row] = [world.measure()] * self._frame_skip
+        self._measured[row] = [world.measure(touches=False)] * self._frame_skip
         self._present[row] = placement.present
         self._contact_distance[row] = np.inf
         self._contact_force[row] = 0

@@ -32,6 +32,7 @@ class LoadedArm:
     Attributes:
         body: number of the body.
         ee: number of the tool link.
+        base: numbers of the links that no joint moves, -1 among them.
         joints: numbers of the arm's joints, from base to tool.
         fingers: numbers of the other movable joints.
         columns: where the arm's joints are among all movable joints, of which Bullet's Jacobian
@@ -45,6 +46,7 @@ class LoadedArm:
 
     body: int
     ee: int
+    base: frozenset[int]
     joints: list[int]
     fingers: list[int]
     columns: list[int]
@@ -122,12 +124,18 @@ def _find_joints(client: int, body: int, chain: set[str], tool_link: str) -> Loa
         for joint in range(pybullet.getNumJoints(body, physicsClientId=client))
     ]
     movable = [info for info in infos if info[2] != pybullet.JOINT_FIXED]
+    base = {-1}
+    # Parents come before their children.
+    for info in infos:
+        if info[2] == pybullet.JOINT_FIXED and info[16] in base:
+            base.add(info[0])
     joints = [info for info in movable if info[1].decode() in chain]
     fingers = [info for info in movable if info[1].decode() not in chain]
     unlimited = [info[8] >= info[9] for info in joints]
     return LoadedArm(
         body=body,
         ee=next(info[0] for info in infos if info[12].decode() == tool_link),
+        base=frozenset(base),
         joints=[info[0] for info in joints],
         fingers=[info[0] for info in fingers],
         columns=[movable.index(info) for info in joints],

@@ -286,16 +286,20 @@ class World:
                 shapes[f"{kind}_{part}"] = (len(bodies), width)
         return shapes
 
-    def measure(self) -> list[float]:
-        """Returns what ``sensing`` asks for as a flat row, in the order of :meth:`trace_shapes`."""
+    def measure(self, *, touches: bool = True) -> list[float]:
+        """Returns what ``sensing`` asks for as a flat row, in the order of :meth:`trace_shapes`.
+
+        Args:
+            touches: read contact points. They are those of the last substep, also after a reset.
+        """
         sensing, client, row = self._sensing, self._client, []
         if sensing.clearance:
             nearest = [self._nearest(index) for index in range(len(self._obstacles))]
             row = [part for parts in zip(*nearest, strict=True) for part in parts]
         if sensing.table:
-            row.append(self._touch(self._furniture))
+            row.append(self._touch(self._furniture) if touches else math.inf)
         if sensing.itself:
-            row.append(self._touch([self._arm.body]))
+            row.append(self._touch([self._arm.body]) if touches else math.inf)
         if sensing.joints:
             row += [state[0] for state in self._joint_states()[: len(self._arm.joints)]]
         if sensing.tool:
@@ -352,7 +356,8 @@ class World:
         return point[8], -_dot(arm_velocity, normal), _dot(obstacle_velocity, normal)
 
     def _touch(self, bodies: Sequence[int]) -> float:
-        """Smallest distance among the contact points of the arm, without its base, and bodies."""
+        """Smallest distance among the contact points of what moves of the arm with bodies."""
+        base = self._arm.base
         return min(
             (
                 point[8]
@@ -360,7 +365,8 @@ class World:
                 for point in pybullet.getContactPoints(
                     self._arm.body, body, physicsClientId=self._client
                 )
-                if point[3] >= 0
+                # Of two links of the arm, one may be the base.
+                if point[3] not in base or (body == self._arm.body and point[4] not in base)
             ),
             default=math.inf,
         )

@@ -28,8 +28,9 @@ class Human:
     The hand waits beside the shoulder, reaches for a point on the way from start to goal, rests
     there for a while, goes back and begins again with another point. It moves along straight
     lines with the minimum-jerk profile of human reaching (Flash & Hogan 1985, J. Neurosci. 5(7));
-    the elbow hangs down. Lengths are those of an average adult (upper arm 0.28 m, forearm and
-    fist 0.35 m; Winter 2009, Biomechanics and Motor Control of Human Movement).
+    the elbow hangs down and away from the robot. Lengths are those of an average adult (upper arm
+    0.28 m, forearm and fist 0.35 m; Winter 2009, Biomechanics and Motor Control of Human
+    Movement).
 
     The person does not yield: it follows its way whatever it hits.
 
@@ -83,6 +84,10 @@ class Human:
         targets = start + along * (goal - start) + rng.uniform(-_SPREAD, _SPREAD, (_REACHES, 3))
         # The centre of the hand stays above the table.
         targets[:, 2] = np.maximum(targets[:, 2], 0.08)
+        # What is too far away is reached for as far as the arm is long.
+        shoulder = np.array(self.shoulder)
+        distance = np.linalg.norm(targets - shoulder, axis=1, keepdims=True)
+        targets = shoulder + np.minimum(1, _REACH / distance) * (targets - shoulder)
         # A reach is four stretches of time: wait, go there, stay there, come back.
         waits = rng.uniform(*self.pause, (_REACHES, 2))
         moves = rng.uniform(*self.duration, (_REACHES, 2))
@@ -109,9 +114,11 @@ class Human:
         way = way / np.maximum(length, 1e-9)
         length = np.clip(length, _NEAREST, _REACH)
         hand = shoulder + length * way
-        # The elbow, by the law of cosines, in the vertical plane of shoulder and hand.
+        # The elbow, by the law of cosines. It hangs down, and away from the robot where the hand
+        # is below the shoulder.
         cosine = (_UPPER_ARM**2 + length**2 - _FOREARM**2) / (2 * _UPPER_ARM * length)
-        down = np.array([0.0, 0.0, -1.0]) + way[:, 2:] * way
+        aside = np.array([*_unit(shoulder[:2]), -1.0])
+        down = aside - (way @ aside)[:, None] * way
         down /= np.maximum(np.linalg.norm(down, axis=1, keepdims=True), 1e-9)
         elbow = shoulder + _UPPER_ARM * (cosine * way + np.sqrt(1 - cosine**2) * down)
         head = np.broadcast_to(shoulder + _HEAD, hand.shape)
@@ -125,6 +132,10 @@ class Human:
             axis=1,
         )
         return positions, from_z_axis(axes)
+
+
+def _unit(vector: Array) -> Array:
+    return vector / np.maximum(np.linalg.norm(vector), 1e-9)
 
 
 def _minimum_jerk(share: Array) -> Array:

@@ -1,0 +1,398 @@
+"""What costs measure, in the real simulator."""
+
+import numpy as np
+import pytest
+from worlds import ARMS, Places, each_arm, home_of, rest, step
+
+from torchrl_safe.envs import (
+    ArmEnv,
+    Box,
+    CartesianDelta,
+    Collision,
+    ContactForce,
+    InFront,
+    JointDelta,
+    JointLimit,
+    Moving,
+    NoObstacles,
+    Proximity,
+    Region,
+    Scene,
+    Sensing,
+    Speed,
+    SpeedAndSeparation,
+    Sphere,
+    Swing,
+    Workspace,
+)
+
+EVERYTHING = {
+    "table": Collision(margin=0.02, table=True),
+    "itself": Collision(itself=True),
+}
+
+
+@each_arm
+def test_at_home_the_arm_touches_neither_table_nor_itself(make_env, arm):
+    """Not even closely, nor when it opens and closes its fingers; what it stands on is no touch."""
+    env = make_env(
+        ArmEnv,
+        arm,
+        action=CartesianDelta(finger_step=0.04),
+        obstacles=NoObstacles(),
+        costs=EVERYTHING,
+        max_episode_steps=1000,
+        seed=0,
+    )
+    env.reset()
+    trace = env.arm_state.trace
+    for opening in (1, -1):
+        for _ in range(10):
+            assert not step(env, [0, 0, 0, opening])["cost"].any()
+    assert trace["table_distance"].shape == trace["self_distance"].shape == (1, 12)
+
+
+@each_arm
+def test_pressing_on_the_table_is_a_touch(make_env, arm):
+    env = make_env(
+        ArmEnv,
+        arm,
+        obstacles=NoObstacles(),
+        costs={"table": Collision(table=True), "none": Collision()},
+        max_episode_steps=1000,
+        seed=0,
+    )
+    env.reset()
+    costs = np.array([step(env, [0, 0, -1])["cost"][0].tolist() for _ in range(12)])
+    assert not costs[:6, 0].any()
+    assert costs[-1, 0]
+    assert not costs[:, 1].any()
+    assert env.arm_state.trace["table_distance"].min() <= 0
+    # The touch is over with the episode.
+    env.reset()
+    assert np.isinf(env.arm_state.trace["table_distance"]).all()
+
+
+# Actions that, kept up, fold the arm into itself; the Panda's hand then presses on its base.
+FOLD = {
+    "panda": [1, 1, -0.5, -1, 0.8, -1, -0.1],
+    "iiwa": [1, -0.5, -0.3, -1, 1, 1, 1],
+    "xarm6": [-0.5, 0.9, 1, 0.1, 1, 1],
+    "xarm7": [-0.5, 1, -1, -1, -0.7, 1, 0.1],
+    "ur5": [-1, -0.1, 1, 1, -0.9, -1],
+    "ur10": [-0.3, -0.1, 1, 1, -0.5, -0.3],
+}
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_folding_into_itself_is_a_touch(make_env, name):
+    env = make_env(
+        ArmEnv,
+        ARMS[name],
+        action=JointDelta(step=0.2),
+        obstacles=NoObstacles(),
+        costs={"itself": Collision(itself=True)},
+        max_episode_steps=1000,
+        seed=0,
+    )
+    env.reset()
+    costs = np.array([step(env, FOLD[name])["cost"].item() for _ in range(25)])
+    assert not costs[0]
+    assert costs[10:].all()
+    env.reset()
+    assert np.isinf(env.arm_state.trace["self_distance"]).all()
+    assert not rest(env)["cost"].any()
+
+
+def test_nothing_is_measured_unless_asked_for(make_env):
+    """And a cost that reads it anyway hears why."""
+    env = make_env(ArmEnv, num_envs=2, costs={"c": Collision(), "f": ContactForce()}, seed=0)
+    env.reset()
+    rest(env)
+    assert dict(env.arm_state.trace) == {}
+    with pytest.raises(KeyError, match="'clearance' is measured only if a cost asks for it"):
+        ArmEnv(costs={"mine": lambda state: state.trace["clearance"][:, -1, 0]})
+
+
+def test_costs_share_what_is_measured(make_env):
+    """The widest range of all, and a plain function may read it too."""
+
+    def mine(state):
+        return state.trace["clearance"].min(axis=(1, 2)).clip(max=9)
+
+    costs = {"near": Proximity(0.05), "far": Proximity(0.4), "mine": mine, "speed": Speed()}
+    env = make_env(ArmEnv, num_envs=2, obstacles=InFront(), costs=costs, seed=0, frame_skip=3)
+    env.reset()
+    near, far, clearance, _ = step(env, [1, 0, 0])["cost"].T.numpy()
+    assert set(env.arm_state.trace) == {
+        *("clearance", "arm_approach", "obstacle_approach", "ee_position", "ee_velocity")
+    }
+    assert env.arm_state.trace["clearance"].shape == (2, 3, 1)
+    assert (clearance < 0.4).all()
+    np.testing.assert_allclose(far, 0.4 - clearance, atol=1e-6)
+    np.testing.assert_allclose(near, np.maximum(0, 0.05 - clearance), atol=1e-6)
+
+
+def gap(angle, centre, radius):
+    """Distance between the turntable's bar at an angle, rad, and a ball, m: a box and a point."""
+    along = np.array([np.cos(angle), np.sin(angle), 0.0])
+    across = np.array([-np.sin(angle), np.cos(angle), 0.0])
+    local = np.subtract(centre, (0, 0, 0.5)) @ np.stack([along, across, np.array([0, 0, 1])], 1)
+    outside = np.maximum(np.abs(local) - (0.5, 0.05, 0.02), 0)
+    return np.linalg.norm(outside) - radius
+
+
+@pytest.mark.parametrize(
+    ("centre", "expected"),
+    [
+        ((0.8, 0.0, 0.5), 0.2),
+        ((0.2, 0.3, 0.5), 0.15),
+        # 0.3 m along, 0.4 m across: 0.5 m from the end.
+        ((0.8, 0.45, 0.5), 0.4),
+        ((0.0, 0.0, 0.82), 0.2),
+        ((0.95, 0.45, 0.5), np.inf),
+    ],
+    ids=["end", "side", "corner", "above", "out-of-range"],
+)
+def test_clearance_is_a_distance_between_surfaces(make_env, turntable, centre, expected):
+    turntable["obstacles"] = Places(Sphere(0.1), at=[centre])
+    env = make_env(ArmEnv, **turntable, costs={"near": Proximity(margin=0.45)})
+    env.reset()
+    for cost in (None, rest(env)["cost"].item()):
+        clearance = env.arm_state.trace["clearance"]
+        np.testing.assert_allclose(clearance, np.full((1, 12, 1), expected), atol=5e-4)
+        assert cost in (None, pytest.approx(max(0, 0.45 - expected), abs=5e-4))
+
+
+def test_obstacles_that_are_absent_are_infinitely_far(make_env, turntable):
+    places = Places(Sphere(0.1), Sphere(0.1), at=[(0.8, 0, 0.5)] * 2, present=[False, True])
+    turntable["obstacles"] = places
+    env = make_env(ArmEnv, **turntable, costs={"near": Proximity(margin=0.45)})
+    env.reset()
+    rest(env)
+    clearance = env.arm_state.trace["clearance"][0, -1]
+    np.testing.assert_allclose(clearance, [np.inf, 0.2], atol=1e-4)
+
+
+def test_approach_of_the_arm_is_minus_the_change_of_clearance(make_env, turntable):
+    """The bar turns towards a ball, and past it."""
+    centre, radius = (0.62, 0.25, 0.5), 0.05
+    turntable["obstacles"] = Places(Sphere(radius), at=[centre])
+    costs = {"apart": SpeedAndSeparation(), "limit": JointLimit()}
+    env = make_env(ArmEnv, **turntable, costs=costs)
+    env.reset()
+    angles, clearances, arm, obstacle = [], [], [], []
+    for _ in range(14):
+        step(env, 0.8)
+        trace = env.arm_state.trace
+        angles += trace["joint_position"][0, :, 0].tolist()
+        clearances += trace["clearance"][0, :, 0].tolist()
+        arm += trace["arm_approach"][0, :, 0].tolist()
+        obstacle += trace["obstacle_approach"][0, :, 0].tolist()
+    expected = [gap(angle, centre, radius) for angle in angles]
+    np.testing.assert_allclose(clearances, expected, atol=1e-3)
+    np.testing.assert_allclose(arm[1:], -np.diff(clearances) * 240, atol=0.03)
+    assert min(arm) < -0.2
+    assert max(arm) > 0.3
+    np.testing.assert_allclose(obstacle, 0)
+
+
+def test_approach_of_an_obstacle_is_minus_the_change_of_clearance(make_env, turntable):
+    """A ball swings before the end of the bar, which holds still."""
+    here = Places(Sphere(0.1), at=[(0.85, 0, 0.5)])
+    turntable["obstacles"] = Moving(here, Swing(amplitude=0.2, period=1.0, direction=(1, 0, 0)))
+    env = make_env(ArmEnv, **turntable, costs={"apart": SpeedAndSeparation()})
+    env.reset()
+    clearances, arm, obstacle, costs = [], [], [], []
+    for _ in range(20):
+        cost = rest(env)["cost"].item()
+        trace = env.arm_state.trace
+        clearances += trace["clearance"][0, :, 0].tolist()
+        arm += trace["arm_approach"][0, :, 0].tolist()
+        obstacle += trace["obstacle_approach"][0, :, 0].tolist()
+        # By the definition: 0.3 s at the speed of the ball, and 0.05 m.
+        needed = 0.05 + 0.3 * np.maximum(0, trace["obstacle_approach"])
+        costs.append(cost == (trace["clearance"] < needed).any())
+    assert all(costs)
+    assert min(clearances) == pytest.approx(0.05, abs=2e-3)
+    assert max(clearances) == pytest.approx(0.45, abs=2e-3)
+    np.testing.assert_allclose(obstacle[1:], -np.diff(clearances) * 240, atol=1e-2)
+    # 2 pi amplitude / period.
+    assert max(obstacle) == pytest.approx(0.4 * np.pi, abs=0.01)
+    np.testing.assert_allclose(arm, 0, atol=1e-3)
+
+
+@each_arm
+def test_approach_of_every_arm(make_env, arm):
+    """Down towards a ball on the table."""
+    ball = Places(Sphere(0.05), at=[np.add(home_of(arm), (0.02, 0.03, -0.15))])
+    env = make_env(ArmEnv, arm, obstacles=ball, costs={"apart": SpeedAndSeparation()}, seed=0)
+    env.reset()
+    rows = []
+    for _ in range(2):
+        step(env, [0.3, 0, -0.5])
+        trace = env.arm_state.trace
+        rows += np.stack([trace[n][0, :, 0] for n in ("clearance", "arm_approach")], 1).tolist()
+    clearance, approach = np.array(rows).T
+    change = -np.diff(clearance) * 240
+    assert change.max() > 0.1
+    np.testing.assert_allclose(approach[1:], change, atol=0.03)
+
+
+def test_speeds_of_the_turntable(make_env, turntable):
+    """The tool point at 0.5 m from the axis; the bar's own centre does not move."""
+    env = make_env(ArmEnv, **turntable, costs={"speed": Speed(limit=0.6, any_link=True)})
+    env.reset()
+    for action in (1.0, 0.5):
+        for _ in range(4):
+            before = env.arm_state.trace["ee_position"][0, -1]
+            cost = step(env, action)["cost"].item()
+            trace = env.arm_state.trace
+            positions = np.vstack([before, trace["ee_position"][0]])
+            velocities = np.diff(positions, axis=0) * 240
+            np.testing.assert_allclose(trace["ee_velocity"][0], velocities, atol=0.02)
+            bar, tool = trace["link_speed"][0].T
+            np.testing.assert_allclose(bar, 0, atol=1e-9)
+            np.testing.assert_allclose(tool, np.linalg.norm(velocities, axis=1), atol=0.02)
+            assert cost == (tool > 0.6).any()
+        # The motor sets out at 0.1 rad in 0.05 s, which is 2 rad/s.
+        assert tool.max() == pytest.approx(action, abs=0.02)
+
+
+@each_arm
+def test_speeds_of_every_arm(make_env, arm):
+    costs = {"speed": Speed(any_link=True), "in": Workspace(Region((-2,) * 3, (2,) * 3))}
+    env = make_env(ArmEnv, arm, action=JointDelta(), obstacles=NoObstacles(), costs=costs, seed=0)
+    env.reset()
+    step(env, 0.3)
+    trace, before = env.arm_state.trace, env.arm_state
+    change = np.diff(trace["ee_position"][0], axis=0) * 240
+    np.testing.assert_allclose(trace["ee_velocity"][0, 1:], change, atol=0.02)
+    np.testing.assert_allclose(trace["ee_position"][0, -1], before.ee_position[0], atol=1e-12)
+    np.testing.assert_allclose(trace["ee_velocity"][0, -1], before.ee_velocity[0], atol=1e-12)
+    # The farthest link is as fast as the tool, if not faster, and the first the slowest.
+    speeds = trace["link_speed"][0, -1]
+    tool = np.linalg.norm(trace["ee_velocity"][0, -1])
+    assert 0.5 * tool < speeds.max() < 1.5 * tool
+    assert speeds[0] < 0.2 * tool
+
+
+def test_a_middle_substep_counts(make_env, turntable):
+    """A cost that is over at the end of the control step, as one that takes the substeps finds."""
+    costs = {"table": Speed(limit=0.9)}
+    turntable["scene"] = Scene(motor_gain=0.3)
+    env = make_env(ArmEnv, **turntable, costs=costs)
+    env.reset()
+    cost = step(env, 1.0)["cost"].item()
+    speed = np.linalg.norm(env.arm_state.trace["ee_velocity"][0], axis=1)
+    assert speed[-1] < 0.9 < speed.max()
+    assert np.linalg.norm(env.arm_state.ee_velocity) == pytest.approx(speed[-1])
+    assert cost == 1
+
+
+def test_joint_limit_is_met(make_env, turntable):
+    env = make_env(ArmEnv, **turntable, costs={"limit": JointLimit(margin=0.05)})
+    env.reset()
+    assert not rest(env)["cost"].any()
+    history = []
+    for _ in range(20):
+        cost = step(env, 1.0)["cost"].item()
+        history.append((env.arm_state.trace["joint_position"].max(), cost))
+    angles, costs = np.array(history).T
+    np.testing.assert_array_equal(costs, angles > 0.95)
+    assert not costs[:5].any()
+    # The limit holds the bar, though it is asked to go on.
+    assert angles[-1] == pytest.approx(1.0, abs=0.02)
+
+
+def test_workspace_is_left(make_env, turntable):
+    """The tool point turns out of a narrow strip."""
+    region = Region((0.0, -0.1, 0.4), (1.0, 0.1, 0.6))
+    env = make_env(ArmEnv, **turntable, costs={"out": Workspace(region)})
+    env.reset()
+    for _ in range(6):
+        cost = step(env, 1.0)["cost"].item()
+        assert cost == (np.abs(env.arm_state.trace["ee_position"][0, :, 1]) > 0.1).any()
+    assert cost == 1
+
+
+def test_weight_is_a_force(make_env, turntable):
+    """2 kg and 0.5 kg rest on the bar: as much force as gravity times mass."""
+    heavy, light = Box((0.04, 0.04, 0.04), mass=2.0), Box((0.04, 0.04, 0.04), mass=0.5)
+    turntable["obstacles"] = Places(heavy, light, at=[(0.15, 0, 0.561), (-0.15, 0, 0.561)])
+    costs = {"force": ContactForce(limit=19.0), "more": ContactForce(limit=20.5)}
+    env = make_env(ArmEnv, **turntable, costs=costs)
+    env.reset()
+    assert (env.arm_state.contact_force == 0).all()
+    result = rest(env, 40)
+    np.testing.assert_allclose(env.arm_state.contact_force, [[19.62, 4.905]], rtol=0.02)
+    assert result["cost"].tolist() == [[1, 0]]
+    assert (np.abs(env.arm_state.obstacle_velocity) < 1e-3).all()
+
+
+def test_effort_limits_the_force(make_env, turntable):
+    """100 N m at 0.45 m from the axis press with 222 N, and with nothing before the touch."""
+    turntable["obstacles"] = Places(Box((0.05, 0.05, 0.05)), at=[(0.45, 0.25, 0.5)])
+    env = make_env(ArmEnv, **turntable, costs={"force": ContactForce(limit=140)})
+    env.reset()
+    forces, costs = [], []
+    for _ in range(60):
+        costs.append(step(env, 1.0)["cost"].item())
+        forces.append(env.arm_state.contact_force.item())
+    assert forces[0] == 0
+    assert costs[0] == 0
+    assert costs[-1] == 1
+    # Where the edge of the block touches: between 0.4 and 0.5 m from the axis.
+    assert 100 / 0.54 < forces[-1] < 100 / 0.40
+
+
+@each_arm
+def test_pressing_on_an_obstacle(make_env, arm):
+    """Harder than nothing, and softer than motors without limits would."""
+    place = np.add(home_of(arm), (0, 0, -0.1))
+    place[2] = 0.05
+    block = Places(Box((0.05, 0.05, 0.05)), at=[place])
+    forces = []
+    for scene in (Scene(), Scene(motor_limits=False)):
+        env = make_env(ArmEnv, arm, obstacles=block, scene=scene, seed=0)
+        env.reset()
+        largest = []
+        for _ in range(8):
+            step(env, [0, 0, -1])
+            largest.append(env.arm_state.contact_force.item())
+        assert largest[0] == 0
+        forces.append(max(largest))
+    assert 5 < forces[0] < forces[1]
+
+
+def test_a_moving_obstacle_touches_an_arm_at_rest(make_env, turntable):
+    """The arm does nothing; the ball comes to it, in one of the substeps."""
+    here = Places(Sphere(0.1), at=[(0.75, 0, 0.5)])
+    turntable["obstacles"] = Moving(here, Swing(amplitude=0.2, period=1.0, direction=(1, 0, 0)))
+    env = make_env(ArmEnv, **turntable, costs={"touch": Collision(), "force": ContactForce(0)})
+    env.reset()
+    touched = 0
+    for _ in range(40):
+        before = env.arm_state.obstacle_position[0, 0, 0]
+        touch, force = rest(env)["cost"][0].tolist()
+        after = env.arm_state.obstacle_position[0, 0, 0]
+        if max(before, after) < 0.595:
+            assert touch == 1
+            touched += 1
+        if min(before, after) > 0.63:
+            assert touch == force == 0
+    assert touched >= 3
+
+
+def test_sensors_are_recognised_by_their_property(make_env):
+    """A user's own cost in five lines."""
+
+    class Elbow:
+        sensing = Sensing(joints=True)
+
+        def __call__(self, state):
+            return state.trace["joint_position"][:, :, 3].max(axis=1) + 3
+
+    env = make_env(ArmEnv, costs={"elbow": Elbow()}, seed=0)
+    env.reset()
+    assert rest(env)["cost"].item() == pytest.approx(3 - 2.849, abs=0.01)
