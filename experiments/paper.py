@@ -1,0 +1,291 @@
+"""Table 1 and Figure 2 of Kovač & Farkaš 2023, run again: ``make paper``.
+
+PPO and constrained PPO with Cartesian (AR1) and joint (AR2) actions, in the paper's environment
+with the paper's settings (those of OpenAI's safety-starter-agents, which the authors' code uses).
+Stopped and started again, it goes on with the runs that are missing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+import tyro
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torch.distributions.transforms import SoftplusTransform
+from torchrl import torchrl_logger
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from tqdm import tqdm
+
+from experiments.evaluation import evaluate
+from experiments.report import COLOURS
+from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ActionMode, paper_env
+from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
+
+ACTIONS: dict[str, ActionMode] = {"AR1": PAPER_CARTESIAN, "AR2": PAPER_JOINT}
+ALGORITHMS = ("PPO", "cPPO")
+CELLS = tuple(f"{action} {algorithm}" for action, algorithm in product(ACTIONS, ALGORITHMS))
+# Mean and standard deviation of "Average Cost": Table 1 of the paper, and the authors' code run
+# again with four seeds (on PyBullet 3.2.7, algorithm unchanged).
+PAPER = {"AR1 PPO": (17.6, 1.3), "AR1 cPPO": (11.9, 3.6), "AR2 PPO": (23.8, 5.0), "AR2 cPPO": (17.0, 1.9)}  # fmt: skip
+RERUN = {"AR1 PPO": (18.9, 2.2), "AR1 cPPO": (14.4, 2.3), "AR2 PPO": (22.5, 4.6), "AR2 cPPO": (18.1, 1.9)}  # fmt: skip
+RERUN_SUCCESS = {"AR1 PPO": 0.85, "AR1 cPPO": 0.78, "AR2 PPO": 0.74, "AR2 cPPO": 0.65}
+# Worlds side by side: the paper has one, of which TorchRL's own time would be most.
+_WORLDS = 10
+_LATE = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Run the paper's four experiments again."""
+
+    seeds: int = 5
+    """Runs of each experiment, with seeds from 0."""
+    epochs: int = 200
+    """Batches of 1000 control steps."""
+    cost_limit: float = 25.0
+    """Limit of the expected cost of an episode, in control steps with a contact."""
+    workers: int = os.cpu_count() or 1
+    """Runs side by side."""
+    eval_episodes: int = 100
+    """Episodes of the final evaluation of each run, with the deterministic policy."""
+    out: Path = Path("runs/paper")
+    """Folder of results; runs that are already there are not run again."""
+
+
+def make_env(action: str, num_envs: int, seed: int) -> EnvBase:
+    """Makes the paper's environment with the sums of reward and cost over each episode."""
+    env = paper_env(ACTIONS[action], num_envs=num_envs, seed=seed)
+    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
+    return TransformedEnv(env, sums)
+
+
+def make_agent(env: EnvBase) -> tuple[ProbabilisticActor, PPOLagrangianLoss]:
+    """Makes a Gaussian policy and the loss: tanh networks of 2 x 64, gamma .99, lambda .97."""
+    width, actions = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+
+    def network(outputs: int) -> MLP:
+        return MLP(width, outputs, num_cells=[64, 64], activation_class=torch.nn.Tanh)
+
+    scale = AddStateIndependentNormalScale(actions, init_value=-0.5)
+    actor = ProbabilisticActor(
+        TensorDictModule(
+            torch.nn.Sequential(network(actions), scale), ["observation"], ["loc", "scale"]
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    loss = PPOLagrangianLoss(
+        actor,
+        ValueOperator(network(1), in_keys=["observation"]),
+        ValueOperator(network(1), in_keys=["observation"], out_keys=["cost_value"]),
+        entropy_bonus=False,
+        loss_critic_type="l2",
+    )
+    loss.make_value_estimator(gamma=0.99, lmbda=0.97, vectorized=True)
+    loss.make_cost_value_estimator(gamma=0.99, lmbda=0.97, vectorized=True)
+    return actor, loss
+
+
+def run(config: Config, cell: str, seed: int) -> dict[str, Any]:
+    """Trains and evaluates one policy."""
+    torchrl_logger.setLevel("WARNING")
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    action, algorithm = cell.split()
+    start = perf_counter()
+    env = make_env(action, _WORLDS, seed)
+    actor, loss = make_agent(env)
+    if algorithm == "cPPO":
+        loss.lagrange_multiplier.fill_(1.0)
+    updater = DualAscent(
+        loss,
+        cost_limit=config.cost_limit,
+        lr=0.05,
+        optimizer=torch.optim.Adam,
+        # A multiplier of zero, PPO's, has no softplus parameter.
+        **({"parametrization": SoftplusTransform()} if algorithm == "cPPO" else {}),
+    )
+    critics = [*loss.critic_network_params.values(True, True)]
+    critics += loss.cost_critic_network_params.values(True, True)
+    policy_optimizer = torch.optim.Adam(loss.actor_network_params.values(True, True), lr=3e-4)
+    critic_optimizer = torch.optim.Adam(critics, lr=1e-3)
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=1000,
+        total_frames=1000 * config.epochs,
+        auto_register_policy_transforms=False,
+    )
+    history = []
+    for batch in collector:
+        ended = batch["next"][batch["next", "done"].squeeze(-1)]
+        if algorithm == "cPPO":
+            updater.step(ended["episode_cost"])
+        data = loss.estimate_advantages(batch).reshape(-1)
+        update(loss, data, policy_optimizer, critic_optimizer)
+        history.append(
+            {
+                "episodes": len(ended),
+                "cost": ended["episode_cost"].sum().item(),
+                "return": ended["episode_reward"].sum().item(),
+                "success": ended["success"].sum().item(),
+                "multiplier": loss.lagrange_multiplier.item(),
+            }
+        )
+    collector.shutdown()
+    test = make_env(action, 20, seed)
+    episodes = evaluate(test, actor, config.eval_episodes, seed=seed + 1_000_000)
+    test.close()
+    return {
+        "cell": cell,
+        "seed": seed,
+        "seconds": perf_counter() - start,
+        "history": history,
+        "evaluation": {
+            "success": episodes["success"].float().mean().item(),
+            "return": episodes["episode_reward"].mean().item(),
+            "cost": episodes["episode_cost"].mean().item(),
+            "touched": (episodes["episode_cost"] > 0).float().mean().item(),
+        },
+    }
+
+
+def update(
+    loss: PPOLagrangianLoss,
+    data: Any,
+    policy_optimizer: torch.optim.Optimizer,
+    critic_optimizer: torch.optim.Optimizer,
+) -> None:
+    """Takes 80 steps on the whole batch; the policy stops when it has moved too far."""
+    moves = True
+    for _ in range(80):
+        losses = loss(data)
+        moves = moves and losses["kl_approx"].item() <= 1.2 * 0.01
+        total = losses["loss_critic"] + losses["loss_cost_critic"]
+        (total + losses["loss_objective"] if moves else total).backward()
+        critic_optimizer.step()
+        if moves:
+            policy_optimizer.step()
+        critic_optimizer.zero_grad()
+        policy_optimizer.zero_grad()
+
+
+def missing(config: Config) -> Iterator[tuple[Path, str, int]]:
+    """The runs whose results are not there yet."""
+    for seed, cell in product(range(config.seeds), CELLS):
+        path = config.out / f"{cell.replace(' ', '-')}-{seed}.json"
+        if not path.exists():
+            yield path, cell, seed
+
+
+def per_epoch(run: dict[str, Any], name: str) -> np.ndarray:
+    """Mean over the episodes that ended in each epoch; NaN where none did."""
+    episodes = np.array([row["episodes"] for row in run["history"]], float)
+    total = np.array([row[name] for row in run["history"]], float)
+    return np.divide(total, episodes, out=np.full_like(total, np.nan), where=episodes > 0)
+
+
+def table(runs: list[dict[str, Any]]) -> str:
+    """Returns the paper's Table 1, with what it leaves out, in Markdown."""
+    lines = [
+        "| | average cost: paper | authors' code again | here | final success: authors' code again "
+        "| here | evaluated: success | cost | episodes with a touch |",
+        "|---" * 9 + "|",
+    ]
+    for cell in CELLS:
+        mine = [run for run in runs if run["cell"] == cell]
+        average = [np.nanmean(per_epoch(run, "cost")) for run in mine]
+        late = [np.nanmean(per_epoch(run, "success")[-_LATE:]) for run in mine]
+        test = {
+            name: [run["evaluation"][name] for run in mine]
+            for name in ("success", "cost", "touched")
+        }
+        lines.append(
+            f"| {cell} | {_spread(*PAPER[cell])} | {_spread(*RERUN[cell])} "
+            f"| {_spread(np.mean(average), np.std(average))} | {RERUN_SUCCESS[cell]:.2f} "
+            f"| {_spread(np.mean(late), np.std(late), 2)} "
+            f"| {_spread(np.mean(test['success']), np.std(test['success']), 2)} "
+            f"| {_spread(np.mean(test['cost']), np.std(test['cost']))} "
+            f"| {np.mean(test['touched']):.0%} |"
+        )
+    return "\n".join(lines)
+
+
+def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:
+    """Draws the paper's Figure 2: mean and standard deviation over seeds."""
+    figure, axes = plt.subplots(1, 3, figsize=(13, 3.8))
+    for cell, colour in zip(CELLS, COLOURS, strict=True):
+        for axis, name in zip(axes, ("return", "cost", "success"), strict=True):
+            curves = np.array([_smooth(per_epoch(r, name)) for r in runs if r["cell"] == cell])
+            thousands = np.arange(1, curves.shape[1] + 1)
+            mean, spread = curves.mean(0), curves.std(0)
+            axis.plot(thousands, mean, color=colour, label=cell)
+            axis.fill_between(thousands, mean - spread, mean + spread, color=colour, alpha=0.15)
+            axis.set(xlabel="thousand control steps", ylabel=f"episode {name}")
+            axis.grid(alpha=0.3)
+    axes[1].axhline(cost_limit, color="black", ls="--", label="limit")
+    axes[1].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main(config: Config) -> None:
+    """Runs what is missing, then writes table, figure and results.json."""
+    config.out.mkdir(parents=True, exist_ok=True)
+    todo = list(missing(config))
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(config.workers, context) as pool:
+        paths = {pool.submit(run, config, cell, seed): path for path, cell, seed in todo}
+        for done in tqdm(as_completed(paths), total=len(todo), desc="paper", unit="run"):
+            # A stopped program leaves no half of a file behind.
+            unfinished = paths[done].with_suffix(".unfinished")
+            unfinished.write_text(json.dumps(done.result()))
+            unfinished.rename(paths[done])
+    runs = [
+        json.loads((config.out / f"{cell.replace(' ', '-')}-{seed}.json").read_text())
+        for seed, cell in product(range(config.seeds), CELLS)
+    ]
+    results = {
+        "config": dataclasses.asdict(config),
+        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
+        "runs": runs,
+    }
+    (config.out / "results.json").write_text(json.dumps(results, default=str))
+    (config.out / "table.md").write_text(table(runs))
+    plot(runs, config.out / "curves.png", config.cost_limit)
+    print(f"\n{table(runs)}\nResults are in {config.out}.")
+
+
+def _spread(mean: float, deviation: float, digits: int = 1) -> str:
+    return f"{mean:.{digits}f} ± {deviation:.{digits}f}"
+
+
+def _smooth(values: np.ndarray, width: int = 10) -> np.ndarray:
+    """Running mean over epochs, of what there is."""
+    return np.array(
+        [
+            np.nanmean(part) if np.isfinite(part).any() else np.nan
+            for part in (values[max(0, end - width) : end] for end in range(1, len(values) + 1))
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
