@@ -13,7 +13,7 @@ from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.shapes import Box, Shape
 from torchrl_safe.envs.state import ArmState, Array
 
-_ATTEMPTS = 1000
+_ATTEMPTS, _PAIRS = 30, 64
 
 
 @runtime_checkable
@@ -227,11 +227,13 @@ def _apart(
     rng: np.random.Generator, region: Region, distance: float, shape: Shape
 ) -> tuple[Array, Array]:
     """Draws a goal and an object on the table, at least some distance apart."""
-    height = shape.half_extents[2]
+    # Most pairs may be too close: many at once take no longer than a few.
     for _ in range(_ATTEMPTS):
-        goal, place = region.sample(rng), region.sample(rng)
-        goal[2] = place[2] = height
-        if np.linalg.norm(goal - place) >= distance:
+        pairs = rng.uniform(region.low, region.high, (_PAIRS, 2, 3))
+        pairs[:, :, 2] = shape.half_extents[2]
+        wide = np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1) >= distance
+        if wide.any():
+            goal, place = pairs[wide.argmax()]
             return goal, place[None]
     raise ValueError(
         f"region must be wide enough for goals at a distance of {distance} m, got {region}."
