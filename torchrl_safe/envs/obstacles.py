@@ -64,10 +64,18 @@ class Placement:
             object.__setattr__(self, name, value)
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Returns positions ``(s, m, 3)`` and orientations ``(s, m, 4)`` at times ``(s,)``."""
+        """Returns positions ``(s, m, 3)`` and orientations ``(s, m, 4)`` at times ``(s,)``.
+
+        Raises:
+            ValueError: if the path has the wrong shape or is not finite.
+        """
+        repeats, count = len(times), len(self.position)
         if self.path is not None:
-            return self.path(times)
-        repeats = len(times)
+            positions, orientations = self.path(times)
+            return (
+                check_array("positions of the path", positions, (repeats, count, 3)),
+                check_array("orientations of the path", orientations, (repeats, count, 4)),
+            )
         return (
             np.repeat(self.position[None], repeats, axis=0),
             np.repeat(self.orientation[None], repeats, axis=0),
