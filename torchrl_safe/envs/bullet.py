@@ -155,8 +155,7 @@ class World:
         self._goal = goal.tolist()
         self._present = np.flatnonzero(placement.present).tolist()
         self._placement, self._substeps = placement, 0
-        positions, orientations = self._look_ahead(1)
-        self._follow(positions, orientations, 0)
+        self._follow(self._look_ahead(1), 0)
         for index, body in enumerate(self._obstacles):
             if index not in self._present:
                 self._poses[index] = (_limbo(index), _UPRIGHT)
@@ -168,27 +167,25 @@ class World:
             if target is not None:
                 self._place(target, self._goal)
 
-    def _look_ahead(self, substeps: int) -> tuple[Array, Array]:
-        """Poses of the obstacles from now until after some substeps, one more than these."""
-        times = SUBSTEP * np.arange(self._substeps, self._substeps + substeps + 1, dtype=float)
-        return self._placement.at(times)
+    def _look_ahead(self, substeps: int) -> list[list]:
+        """Poses and velocities of the obstacles now and after each of some substeps.
 
-    def _follow(self, positions: Array, orientations: Array, substep: int) -> None:
+        In the order position, orientation, velocity and angular velocity, which is the one that
+        led there; now it is the one that follows.
+        """
+        times = SUBSTEP * np.arange(self._substeps, self._substeps + substeps + 1, dtype=float)
+        positions, orientations = self._placement.at(times)
+        linear = np.diff(positions, axis=0) / SUBSTEP
+        angular = rotation_vector(orientations[:-1], orientations[1:]) / SUBSTEP
+        linear, angular = (np.concatenate([part[:1], part]) for part in (linear, angular))
+        return [part.tolist() for part in (positions, orientations, linear, angular)]
+
+    def _follow(self, ahead: list[list], substep: int) -> None:
         """Takes the obstacles' poses and velocities of one of the substeps ahead."""
-        now, later = max(substep - 1, 0), max(substep, 1)
-        linear = (positions[later] - positions[now]) / SUBSTEP
-        angular = rotation_vector(orientations[now], orientations[later]) / SUBSTEP
-        rows = zip(
-            positions[substep].tolist(),
-            orientations[substep].tolist(),
-            linear.tolist(),
-            angular.tolist(),
-            strict=True,
-        )
-        for index, (position, orientation, velocity, spin) in enumerate(rows):
-            if index in self._present:
-                self._poses[index] = (position, orientation)
-                self._velocities[index] = (velocity, spin)
+        for index in self._present:
+            position, orientation, velocity, spin = (part[substep][index] for part in ahead)
+            self._poses[index] = (position, orientation)
+            self._velocities[index] = (velocity, spin)
 
     def advance(
         self, joint_target: _Vector, finger_target: _Vector, substeps: int
@@ -210,7 +207,7 @@ class World:
         senses = self._sensing != Sensing()
         for substep in range(1, substeps + 1):
             if ahead is not None:
-                self._follow(*ahead, substep)
+                self._follow(ahead, substep)
                 for index in self._present:
                     self._place(self._obstacles[index], *self._poses[index])
             pybullet.stepSimulation(physicsClientId=client)
