@@ -35,7 +35,8 @@ class Placement:
             leaves them where they are, or to physics.
 
     Raises:
-        ValueError: if something has the wrong shape or is not finite.
+        ValueError: if something has the wrong shape or is not finite, or an orientation is not a
+            unit quaternion.
 
     Examples:
         >>> Placement([[0.5, 0.0, 0.1]]).present
@@ -60,6 +61,10 @@ class Placement:
             ),
             "present": present,
         }
+        if not np.allclose(np.linalg.norm(filled["orientation"], axis=1), 1, atol=1e-3):
+            raise ValueError(
+                f"orientation must be unit quaternions (x, y, z, w), got {self.orientation}."
+            )
         for name, value in filled.items():
             object.__setattr__(self, name, value)
 
@@ -221,9 +226,10 @@ class Scattered:
                 f"clearance and spacing must not be negative, got {self.clearance} and "
                 f"{self.spacing}."
             )
-        if self.fewest is not None and not 0 <= self.fewest <= self.count:
+        if self.fewest is not None and (self.fewest % 1 or not 0 <= self.fewest <= self.count):
             raise ValueError(
-                f"fewest must be between 0 and count = {self.count}, got {self.fewest}."
+                f"fewest must be a whole number between 0 and count = {self.count}, got "
+                f"{self.fewest}."
             )
 
     @property
