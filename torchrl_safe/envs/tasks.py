@@ -151,8 +151,8 @@ class PickAndPlace:
     must move the fingers: ``CartesianDelta(finger_step=0.04)``.
 
     Args:
-        region: where the goal is drawn, uniformly, and the cube below. ``None`` takes the arm's
-            ``goals``.
+        region: where the goal is drawn, uniformly, and the cube below; a goal in the air is not
+            lower than one on the table. ``None`` takes the arm's ``goals``.
         radius: distance between cube and goal at which the task is done, m.
         distance: smallest horizontal distance between cube and goal at the start, m.
         on_table: share of the goals that lie on the table.
@@ -190,7 +190,7 @@ class PickAndPlace:
         region = self.region or goals
         goal, objects = _apart(rng, region, self.distance, self.shape)
         if rng.random() >= self.on_table:
-            goal[2] += rng.uniform(region.low[2], region.high[2])
+            goal[2] = max(goal[2], rng.uniform(region.low[2], region.high[2]))
         return goal, objects
 
     def reward(self, state: ArmState) -> Array:
