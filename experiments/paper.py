@@ -41,8 +41,18 @@ ALGORITHMS = ("PPO", "cPPO")
 CELLS = tuple(f"{action} {algorithm}" for action, algorithm in product(ACTIONS, ALGORITHMS))
 # Mean and standard deviation of "Average Cost": Table 1 of the paper, and the authors' code run
 # again with four seeds (on PyBullet 3.2.7, algorithm unchanged).
-PAPER = {"AR1 PPO": (17.6, 1.3), "AR1 cPPO": (11.9, 3.6), "AR2 PPO": (23.8, 5.0), "AR2 cPPO": (17.0, 1.9)}  # fmt: skip
-RERUN = {"AR1 PPO": (18.9, 2.2), "AR1 cPPO": (14.4, 2.3), "AR2 PPO": (22.5, 4.6), "AR2 cPPO": (18.1, 1.9)}  # fmt: skip
+PAPER = {
+    "AR1 PPO": (17.6, 1.3),
+    "AR1 cPPO": (11.9, 3.6),
+    "AR2 PPO": (23.8, 5.0),
+    "AR2 cPPO": (17.0, 1.9),
+}
+RERUN = {
+    "AR1 PPO": (18.9, 2.2),
+    "AR1 cPPO": (14.4, 2.3),
+    "AR2 PPO": (22.5, 4.6),
+    "AR2 cPPO": (18.1, 1.9),
+}
 RERUN_SUCCESS = {"AR1 PPO": 0.85, "AR1 cPPO": 0.78, "AR2 PPO": 0.74, "AR2 cPPO": 0.65}
 # Worlds side by side: the paper has one, of which TorchRL's own time would be most.
 _WORLDS = 10
@@ -111,16 +121,16 @@ def run(config: Config, cell: str, seed: int) -> dict[str, Any]:
     start = perf_counter()
     env = make_env(action, _WORLDS, seed)
     actor, loss = make_agent(env)
+    updater = None
     if algorithm == "cPPO":
         loss.lagrange_multiplier.fill_(1.0)
-    updater = DualAscent(
-        loss,
-        cost_limit=config.cost_limit,
-        lr=0.05,
-        optimizer=torch.optim.Adam,
-        # A multiplier of zero, PPO's, has no softplus parameter.
-        **({"parametrization": SoftplusTransform()} if algorithm == "cPPO" else {}),
-    )
+        updater = DualAscent(
+            loss,
+            cost_limit=config.cost_limit,
+            lr=0.05,
+            optimizer=torch.optim.Adam,
+            parametrization=SoftplusTransform(),
+        )
     critics = [*loss.critic_network_params.values(True, True)]
     critics += loss.cost_critic_network_params.values(True, True)
     policy_optimizer = torch.optim.Adam(loss.actor_network_params.values(True, True), lr=3e-4)
@@ -135,7 +145,7 @@ def run(config: Config, cell: str, seed: int) -> dict[str, Any]:
     history = []
     for batch in collector:
         ended = batch["next"][batch["next", "done"].squeeze(-1)]
-        if algorithm == "cPPO":
+        if updater is not None:
             updater.step(ended["episode_cost"])
         data = loss.estimate_advantages(batch).reshape(-1)
         update(loss, data, policy_optimizer, critic_optimizer)

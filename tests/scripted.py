@@ -20,7 +20,10 @@ SAFE_HEIGHT, LOW = 0.33, 0.033
 # Orientations of the tool that keep the arm off an obstacle beside the object. Turned by a
 # quarter, the hand shows it its narrow side; to which side, decides where the elbow of an arm
 # with seven joints goes. The wrist of a UR hangs too low for that: leaning, it stays back.
-LEFT, RIGHT = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0), (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
+LEFT, RIGHT = (
+    (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
+    (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),
+)
 LEANING = (0.0, math.cos(0.3), 0.0, math.sin(0.3))
 HOLD = {PANDA: RIGHT, IIWA: RIGHT, XARM6: RIGHT, XARM7: LEFT, UR5: LEANING, UR10: LEANING}
 

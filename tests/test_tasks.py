@@ -1,8 +1,24 @@
 import numpy as np
 import pytest
 from states import make_state
+from worlds import ARMS, Places, each_arm, rest, step
 
-from torchrl_safe.envs import Reach, Region
+from torchrl_safe.envs import (
+    PANDA,
+    ArmEnv,
+    Box,
+    CartesianDelta,
+    Cylinder,
+    NoObstacles,
+    PickAndPlace,
+    Push,
+    Reach,
+    Region,
+)
+
+CUBE = Box((0.02, 0.02, 0.02), mass=1.0)
+GRIP = CartesianDelta(finger_step=0.04)
+each_object_task = pytest.mark.parametrize("kind", [Push, PickAndPlace])
 
 
 def test_reach_is_euclidean():
@@ -38,3 +54,179 @@ def test_goals_fill_the_box():
 def test_reach_rejects(arguments, message):
     with pytest.raises(ValueError, match=message):
         Reach(**arguments)
+
+
+def draws(task, goals, count=400):
+    rng = np.random.default_rng(0)
+    pairs = [task.sample(rng, goals) for _ in range(count)]
+    return np.array([goal for goal, _ in pairs]), np.array([objects for _, objects in pairs])
+
+
+@each_arm
+@each_object_task
+def test_object_and_goal_are_apart(arm, kind):
+    """On the table, in the arm's region, and at least so far from each other."""
+    goals, objects = draws(kind(distance=0.25), arm.goals)
+    assert objects.shape == (400, 1, 3)
+    flat = (1, 1, 0)
+    region = Region(arm.goals.low * np.array(flat), arm.goals.high * np.array(flat))
+    assert region.contains(goals * flat).all()
+    assert region.contains(objects * flat).all()
+    np.testing.assert_array_equal(objects[:, :, 2], 0.02)
+    apart = np.linalg.norm((goals - objects[:, 0])[:, :2], axis=1)
+    assert 0.25 <= apart.min() < 0.26
+    # Either may be left.
+    left = (goals[:, 1] > objects[:, 0, 1]).mean()
+    assert 0.4 < left < 0.6
+    if kind is Push:
+        np.testing.assert_array_equal(goals[:, 2], 0.02)
+
+
+@each_object_task
+def test_own_region_and_shape(kind):
+    region = Region((0.4, -0.3, 0.5), (0.8, 0.3, 0.6))
+    can = Cylinder(radius=0.03, height=0.1, mass=0.2)
+    goals, objects = draws(kind(region=region, shape=can), PANDA.goals)
+    np.testing.assert_allclose(objects[:, 0].min(0), (0.4, -0.3, 0.05), atol=0.02)
+    np.testing.assert_allclose(objects[:, 0].max(0), (0.8, 0.3, 0.05), atol=0.02)
+    np.testing.assert_allclose(goals[:, :2].max(0), (0.8, 0.3), atol=0.02)
+    assert kind(shape=can).objects == (can,)
+
+
+@pytest.mark.parametrize(("share", "low", "high"), [(0.0, 0, 0), (0.3, 0.25, 0.35), (1.0, 1, 1)])
+def test_share_of_goals_on_the_table(share, low, high):
+    goals, _ = draws(PickAndPlace(on_table=share), PANDA.goals, 1000)
+    on_table = goals[:, 2] == 0.02
+    assert low <= on_table.mean() <= high
+    if share < 1:
+        # The others are in the region, at any height.
+        air = goals[~on_table]
+        assert PANDA.goals.contains(air).all()
+        np.testing.assert_allclose([air[:, 2].min(), air[:, 2].max()], [0.05, 0.15], atol=2e-3)
+
+
+@each_object_task
+@pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
+def test_rewards(kind, sparse):
+    """The distance of object and goal, wherever the tool is; or -1 and 0."""
+    state = make_state(
+        goal=[[0.3, 0.4, 0.0], [0.5, 0.0, 0.25]],
+        object_position=[[[0.0, 0.0, 0.0]], [[0.5, 0.0, 0.24]]],
+        finger_position=np.zeros((2, 2)),
+    )
+    task = kind(sparse=sparse)
+    np.testing.assert_allclose(task.reward(state), [-1, 0] if sparse else [-0.5, -0.01])
+    np.testing.assert_array_equal(task.success(state), [False, True])
+
+
+@pytest.mark.parametrize("kind", [Reach, Push, PickAndPlace])
+def test_at_the_radius_is_not_within_it(kind):
+    """Of the same mind: a sparse reward is 0 where the task is done."""
+    places = np.array([[0.25, 0, 0], [0.2499, 0, 0]])
+    state = make_state(
+        goal=np.zeros((2, 3)),
+        ee_position=places,
+        object_position=places[:, None],
+        finger_position=np.zeros((2, 2)),
+    )
+    task = kind(radius=0.25, sparse=True)
+    np.testing.assert_array_equal(task.success(state), [False, True])
+    np.testing.assert_array_equal(task.reward(state), [-1, 0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        ({"radius": 0}, ValueError, "radius must be positive and finite, got 0"),
+        ({"distance": np.nan}, ValueError, "distance must be positive and finite, got nan"),
+        ({"shape": Box()}, ValueError, r"shape must have a mass to be moved, got Box\("),
+        ({"shape": "box"}, TypeError, "shape must be an instance of Cylinder or Box or"),
+        ({"region": (0, 1)}, TypeError, r"region must be an instance of Region, got \(0, 1\)"),
+    ],
+)
+@pytest.mark.parametrize("task", [Push, PickAndPlace])
+def test_object_tasks_reject(task, arguments, kind, message):
+    with pytest.raises(kind, match=message):
+        task(**arguments)
+
+
+@each_object_task
+def test_region_must_be_wide_enough(kind):
+    """It says so when the environment is made."""
+    task = kind(region=Region((0.5, -0.1, 0), (0.6, 0.1, 0)))
+    with pytest.raises(ValueError, match=r"region must be wide enough .* distance of 0.3 m, got R"):
+        ArmEnv(task=task, action=GRIP)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, np.nan])
+def test_on_table_is_a_share(share):
+    with pytest.raises(ValueError, match=f"on_table must be between 0 and 1, got {share}"):
+        PickAndPlace(on_table=share)
+
+
+def test_picking_needs_fingers():
+    with pytest.raises(ValueError, match="action must move the fingers to pick something up"):
+        ArmEnv(task=PickAndPlace())
+
+
+@pytest.mark.parametrize(
+    ("task", "what"),
+    [
+        (Reach(Region((2, 0, 0.1), (2.1, 0, 0.1))), "goals"),
+        (Push(Region((0.9, -0.5, 0), (1.0, 0.5, 0))), "goals"),
+    ],
+    ids=["reach", "push"],
+)
+def test_unreachable_goals(task, what):
+    with pytest.raises(ValueError, match=rf"task must draw {what} that the arm can reach, got \["):
+        ArmEnv(task=task, obstacles=NoObstacles())
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_objects_lie_still(make_env, name):
+    """Where they were put, on the table, until something touches them."""
+    env = make_env(ArmEnv, ARMS[name], num_envs=2, task=Push(), obstacles=NoObstacles(), seed=0)
+    env.reset()
+    start = env.arm_state.object_position
+    np.testing.assert_array_equal(start[:, 0, 2], 0.02)
+    np.testing.assert_array_equal(env.arm_state.object_orientation, [[[0, 0, 0, 1]]] * 2)
+    rest(env, 10)
+    state = env.arm_state
+    np.testing.assert_allclose(state.object_position, start, atol=1e-3)
+    assert np.abs(state.object_velocity).max() < 5e-3
+    assert np.abs(state.object_angular_velocity).max() < 0.05
+
+
+@each_arm
+def test_the_arm_pushes_the_object(make_env, arm):
+    """Down before the cube, then into it: it goes where the tool goes, and the reward follows."""
+    env = make_env(ArmEnv, arm, task=Push(), obstacles=NoObstacles(), max_episode_steps=500, seed=1)
+    env.reset()
+    start, goal = env.arm_state.object_position[0, 0], env.arm_state.goal[0]
+    before, behind = start - (0.08, 0, 0), np.add(start, (0.05, 0, 0))
+    for stop in ([*before[:2], 0.2], before, behind):
+        for _ in range(30):
+            way = stop - env.arm_state.ee_position[0]
+            if np.linalg.norm(way) < 0.015:
+                break
+            result = step(env, (way / max(0.05, np.abs(way).max())))
+    place = env.arm_state.object_position[0, 0]
+    assert place[0] > start[0] + 0.04
+    assert abs(place[1] - start[1]) < 0.03
+    reward = -np.linalg.norm(place - goal)
+    assert result["reward"].item() == pytest.approx(reward, abs=1e-6)
+
+
+def test_the_first_object_is_where_the_way_begins(make_env):
+    """Obstacles of a pushing task stand between cube and goal."""
+
+    class Note(Places):
+        def sample(self, rng, start, goal):
+            self.seen = start, goal
+            return super().sample(rng, start, goal)
+
+    layout = Note(at=np.zeros((0, 3)))
+    env = make_env(ArmEnv, task=Push(), obstacles=layout, seed=0)
+    env.reset()
+    np.testing.assert_array_equal(layout.seen[0], env.arm_state.object_position[0, 0])
+    np.testing.assert_array_equal(layout.seen[1], env.arm_state.goal[0])

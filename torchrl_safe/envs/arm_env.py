@@ -356,6 +356,10 @@ class ArmEnv(EnvBase):
         check_kind("placement", placement, Placement)
         count = len(self.obstacles.shapes)
         check_array("obstacle positions", placement.position, (count, 3))
+        if placement.path is not None and any(shape.mass for shape in self.obstacles.shapes):
+            raise ValueError(
+                f"path moves fixed shapes only (mass 0), got one for {self.obstacles.shapes}."
+            )
         return placement
 
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:

@@ -35,7 +35,8 @@ class Placement:
             leaves them where they are, or to physics.
 
     Raises:
-        ValueError: if something has the wrong shape or is not finite.
+        ValueError: if something has the wrong shape or is not finite, or an orientation is not a
+            unit quaternion.
 
     Examples:
         >>> Placement([[0.5, 0.0, 0.1]]).present
@@ -60,14 +61,26 @@ class Placement:
             ),
             "present": present,
         }
+        if not np.allclose(np.linalg.norm(filled["orientation"], axis=1), 1, atol=1e-3):
+            raise ValueError(
+                f"orientation must be unit quaternions (x, y, z, w), got {self.orientation}."
+            )
         for name, value in filled.items():
             object.__setattr__(self, name, value)
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Returns positions ``(s, m, 3)`` and orientations ``(s, m, 4)`` at times ``(s,)``."""
+        """Returns positions ``(s, m, 3)`` and orientations ``(s, m, 4)`` at times ``(s,)``.
+
+        Raises:
+            ValueError: if the path has the wrong shape or is not finite.
+        """
+        repeats, count = len(times), len(self.position)
         if self.path is not None:
-            return self.path(times)
-        repeats = len(times)
+            positions, orientations = self.path(times)
+            return (
+                check_array("positions of the path", positions, (repeats, count, 3)),
+                check_array("orientations of the path", orientations, (repeats, count, 4)),
+            )
         return (
             np.repeat(self.position[None], repeats, axis=0),
             np.repeat(self.orientation[None], repeats, axis=0),
@@ -213,9 +226,10 @@ class Scattered:
                 f"clearance and spacing must not be negative, got {self.clearance} and "
                 f"{self.spacing}."
             )
-        if self.fewest is not None and not 0 <= self.fewest <= self.count:
+        if self.fewest is not None and (self.fewest % 1 or not 0 <= self.fewest <= self.count):
             raise ValueError(
-                f"fewest must be between 0 and count = {self.count}, got {self.fewest}."
+                f"fewest must be a whole number between 0 and count = {self.count}, got "
+                f"{self.fewest}."
             )
 
     @property

@@ -37,13 +37,14 @@ def multiply(first: Array, second: Array) -> Array:
         >>> multiply(half, half)
         array([ 0.,  0.,  0., -1.])
     """
-    vector, scalar = first[..., :3], first[..., 3:]
-    other, other_scalar = second[..., :3], second[..., 3:]
-    product = scalar * other + other_scalar * vector + np.cross(vector, other)
-    return np.concatenate(
+    x, y, z, w = np.moveaxis(first, -1, 0)
+    other_x, other_y, other_z, other_w = np.moveaxis(second, -1, 0)
+    return np.stack(
         [
-            product,
-            scalar * other_scalar - (vector * other).sum(axis=-1, keepdims=True),
+            w * other_x + other_w * x + (y * other_z - z * other_y),
+            w * other_y + other_w * y + (z * other_x - x * other_z),
+            w * other_z + other_w * z + (x * other_y - y * other_x),
+            w * other_w - (x * other_x + y * other_y + z * other_z),
         ],
         axis=-1,
     )

@@ -13,7 +13,7 @@ from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.shapes import Box, Shape
 from torchrl_safe.envs.state import ArmState, Array
 
-_ATTEMPTS = 1000
+_ATTEMPTS, _PAIRS = 30, 64
 
 
 @runtime_checkable
@@ -153,8 +153,8 @@ class PickAndPlace:
     fingers: ``CartesianDelta(finger_step=0.04)``.
 
     Args:
-        region: where the goal is drawn, uniformly, and the cube below. ``None`` takes the arm's
-            ``goals``.
+        region: where the goal is drawn, uniformly, and the cube below; a goal in the air is not
+            lower than one on the table. ``None`` takes the arm's ``goals``.
         radius: distance between cube and goal at which the task is done, m.
         distance: smallest horizontal distance between cube and goal at the start, m.
         on_table: share of the goals that lie on the table.
@@ -192,7 +192,7 @@ class PickAndPlace:
         region = self.region or goals
         goal, objects = _apart(rng, region, self.distance, self.shape)
         if rng.random() >= self.on_table:
-            goal[2] += rng.uniform(region.low[2], region.high[2])
+            goal[2] = max(goal[2], rng.uniform(region.low[2], region.high[2]))
         return goal, objects
 
     def reward(self, state: ArmState) -> Array:
@@ -229,12 +229,14 @@ def _apart(
     rng: np.random.Generator, region: Region, distance: float, shape: Shape
 ) -> tuple[Array, Array]:
     """Draws a goal and an object on the table, at least some distance apart."""
-    pairs = rng.uniform(region.low, region.high, (_ATTEMPTS, 2, 3))
-    pairs[:, :, 2] = shape.half_extents[2]
-    apart = np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1) >= distance
-    if apart.any():
-        goal, place = pairs[apart.argmax()]
-        return goal, place[None]
+    # Most pairs may be too close: many at once take no longer than a few.
+    for _ in range(_ATTEMPTS):
+        pairs = rng.uniform(region.low, region.high, (_PAIRS, 2, 3))
+        pairs[:, :, 2] = shape.half_extents[2]
+        wide = np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1) >= distance
+        if wide.any():
+            goal, place = pairs[wide.argmax()]
+            return goal, place[None]
     raise ValueError(
         f"region must be wide enough for goals at a distance of {distance} m, got {region}."
     )
