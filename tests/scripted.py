@@ -115,8 +115,14 @@ def push_around(env, row):
 
 
 def push_straight(env, row):
-    """Pushes the object straight at the goal."""
-    yield from _push_to(env, row, env.arm_state.goal[row])
+    """Straight at the goal; where the object is stopped, the tool goes on over it."""
+    goal = env.arm_state.goal[row]
+    yield from _get_behind(env, row, goal)
+    for _ in range(15):
+        yield _at_height(goal, LOW), 0.0
+    yield from go(env, row, _at_height(env.arm_state.ee_position[row], 0.15))
+    while True:
+        yield _at_height(goal, 0.15), 0.0
 
 
 def rise(env, row, opening=0.0):
@@ -138,18 +144,23 @@ def distance(env, row, point):
 def _push_to(env, row, stop):
     """One push after the other, each for as long as the object stays before the tool."""
     while np.linalg.norm(stop - env.arm_state.object_position[row, 0]) > 0.02:
-        here = env.arm_state.object_position[row, 0]
-        behind = here - 0.05 * _unit(stop - here)
-        yield from rise(env, row)
-        yield from go(env, row, _at_height(behind, SAFE_HEIGHT), tolerance=0.02)
-        yield from go(env, row, _at_height(behind, LOW), tolerance=0.005)
-        aside = np.zeros(3)
+        yield from _get_behind(env, row, stop)
+        here, aside = env.arm_state.object_position[row, 0], np.zeros(3)
         while np.linalg.norm(stop - here) > 0.02 and np.linalg.norm(aside) < 0.025:
             here, tool = env.arm_state.object_position[row, 0], env.arm_state.ee_position[row]
             forward = _unit(_at_height(stop - here, 0))
             aside = _at_height(here - tool, 0) @ (np.eye(3) - np.outer(forward, forward))
             # It is pushed back to the line by pushing where it has gone.
             yield _at_height(tool + 0.02 * forward + 0.25 * aside, LOW), 0.0
+
+
+def _get_behind(env, row, stop):
+    """Down to the table, where the object is between the tool and where it is to go."""
+    here = env.arm_state.object_position[row, 0]
+    behind = here - 0.05 * _unit(stop - here)
+    yield from rise(env, row)
+    yield from go(env, row, _at_height(behind, SAFE_HEIGHT), tolerance=0.02)
+    yield from go(env, row, _at_height(behind, LOW), tolerance=0.005)
 
 
 def _away_from_obstacles(env, row):

@@ -155,7 +155,7 @@ def test_going_around_costs_nothing(make_env):
 
     def around(env, row):
         goal = env.arm_state.goal[row]
-        side = goal + [0, -0.22 if goal[1] > 0 else 0.22, 0.12]
+        side = goal + np.array([0, -0.22 if goal[1] > 0 else 0.22, 0.12])
         yield from go(env, row, np.array([0.43, side[1], 0.25]))
         yield from go(env, row, side)
         yield from straight(env, row)
