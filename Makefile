@@ -10,8 +10,9 @@ READY := $(VENV)/.ready
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
 
-test: $(READY)  ## everything but the slow tests
-	$(BIN)/pytest -m "not slow" $(ARGS)
+# One thread each: the processes have the cores to themselves.
+test: $(READY)  ## everything but the slow tests, on two cores
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not slow" $(ARGS)
 
 test-slow: $(READY)  ## the tests that train for minutes
 	$(BIN)/pytest -m slow $(ARGS)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from states import make_state
 from tensordict import TensorDict
+from worlds import each_arm, step, turn
 
 from torchrl_safe.envs import (
     PANDA,
@@ -248,3 +249,89 @@ def test_rotation_vector_takes_the_short_way():
 def test_bad_arguments(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def heading(env):
+    """The axes of the tool in the world, as columns, ``(3, 3)``."""
+    return turn(np.tile(env.arm_state.ee_orientation[0], (3, 1)), np.eye(3)).T
+
+
+def angle_between(one, other):
+    """How far a frame is turned from another, rad, and about which axis."""
+    difference = other @ one.T
+    axis = np.array([difference[2, 1], difference[0, 2], difference[1, 0]])
+    axis -= np.array([difference[1, 2], difference[2, 0], difference[0, 1]])
+    return np.arctan2(np.linalg.norm(axis), np.trace(difference) - 1), axis
+
+
+@each_arm
+def test_yaw_turns_the_tool_about_the_vertical(make_env, arm):
+    """In ten steps by as many steps' angles; it points down and stays where it is."""
+    action = CartesianDelta(yaw_step=0.05)
+    env = make_env(ArmEnv, arm, action=action, obstacles=NoObstacles(), max_episode_steps=99)
+    env.reset()
+    start, place = heading(env), env.arm_state.ee_position[0]
+    for sign in (1, -1):
+        before = heading(env)
+        for _ in range(10):
+            step(env, [0, 0, 0, sign])
+            assert heading(env)[2, 2] < -0.999
+        angle, axis = angle_between(before, heading(env))
+        # The motors come within a third of what they are asked for.
+        assert 0.3 < angle < 0.52
+        assert sign * axis[2] > 0.99 * np.linalg.norm(axis)
+        assert np.linalg.norm(env.arm_state.ee_position[0] - place) < 0.01
+    assert angle_between(start, heading(env))[0] < 0.05
+
+
+@pytest.mark.parametrize("index", range(3))
+@each_arm
+def test_rotation_turns_the_tool_about_each_axis(make_env, arm, index):
+    """Of the world, not of the tool."""
+    action = CartesianDelta(rotation_step=0.05)
+    env = make_env(ArmEnv, arm, action=action, obstacles=NoObstacles(), max_episode_steps=99)
+    env.reset()
+    before, place = heading(env), env.arm_state.ee_position[0]
+    for _ in range(6):
+        step(env, np.eye(6)[3 + index])
+    angle, axis = angle_between(before, heading(env))
+    assert 0.15 < angle < 0.32
+    assert axis[index] > 0.97 * np.linalg.norm(axis)
+    assert np.linalg.norm(env.arm_state.ee_position[0] - place) < 0.015
+
+
+@pytest.mark.parametrize("mode", [CartesianDelta, JointDelta])
+@each_arm
+def test_fingers_open_and_close(make_env, arm, mode):
+    """To the width that the last component asks for, and no further than closed."""
+    env = make_env(
+        ArmEnv, arm, action=mode(finger_step=0.04), obstacles=NoObstacles(), max_episode_steps=99
+    )
+    env.reset()
+    action = np.zeros(env.action_spec.shape[1])
+    for opening, expected in ((1.0, 0.04), (0.5, 0.02), (0.0, 0.0), (1.0, 0.04), (-1.0, 0.0)):
+        action[-1] = opening
+        for _ in range(12):
+            step(env, action)
+        fingers = env.arm_state.finger_position
+        assert fingers.shape == (1, 2)
+        np.testing.assert_allclose(fingers, [[expected] * 2], atol=2e-3)
+    np.testing.assert_allclose(env.arm_state.joint_position, [arm.home], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("mode", "width"),
+    [
+        (CartesianDelta(), 3),
+        (CartesianDelta(finger_step=0.04), 4),
+        (CartesianDelta(yaw_step=0.1), 4),
+        (CartesianDelta(rotation_step=0.1), 6),
+        (CartesianDelta(rotation_step=0.1, finger_step=0.04), 7),
+        (JointDelta(), 6),
+        (JointDelta(finger_step=0.04), 7),
+    ],
+    ids=str,
+)
+def test_widths(mode, width):
+    assert mode.width(num_joints=6) == width
+    assert mode.moves_fingers == (mode.finger_step is not None)

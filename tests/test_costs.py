@@ -253,6 +253,8 @@ def test_sensing_adds_up():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: Sensing(clearance=-1), "clearance must be finite and not negative, got -1"),
+        (lambda: Sensing(clearance=np.nan), "clearance must be finite and not negative, got nan"),
         (lambda: ContactForce(limit=-1), "limit must not be negative, got -1"),
         (lambda: ContactForce(limit=np.nan), "limit must be finite, got nan"),
         (lambda: ContactForce(limit=[1, 2]), r"limit must have shape \(\), got \(2,\)"),

@@ -48,7 +48,7 @@ def test_swing(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_patrol(seed):
-    """To and fro between two ends, at constant speed but where it turns."""
+    """Back and forth between two ends, at constant speed but where it turns."""
     motion = Patrol(distance=0.3, speed=0.2, direction=(3, 4, 0))
     displacement = draw(motion, seed)
     times = np.arange(0, 6, 1 / RATE)

@@ -396,3 +396,13 @@ def test_sensors_are_recognised_by_their_property(make_env):
     env = make_env(ArmEnv, costs={"elbow": Elbow()}, seed=0)
     env.reset()
     assert rest(env)["cost"].item() == pytest.approx(3 - 2.849, abs=0.01)
+
+
+def test_sensing_must_be_one():
+    """A cost with a property of that name that means something else."""
+
+    class Mine(Collision):
+        sensing = True
+
+    with pytest.raises(TypeError, match="sensing of cost 'mine' must be an instance of Sensing"):
+        ArmEnv(costs={"mine": Mine()})

@@ -135,14 +135,16 @@ class ArmEnv(EnvBase):
         self._scene = replace(scene, free_fingers=True) if action.moves_fingers else scene
         self._elapsed = np.zeros(num_envs, dtype=int)
         self.set_seed(seed)
-        sensors = [cost.sensing for cost in costs.values() if isinstance(cost, Sensor)]
+        sensors = {name: cost.sensing for name, cost in costs.items() if isinstance(cost, Sensor)}
+        for name, sensing in sensors.items():
+            check_kind(f"sensing of cost {name!r}", sensing, Sensing)
         self._batch = WorldBatch(
             num_envs,
             arm,
             self._scene,
             obstacles.shapes,
             task.objects,
-            sensing=reduce(or_, sensors, Sensing()),
+            sensing=reduce(or_, sensors.values(), Sensing()),
             frame_skip=frame_skip,
             gui=gui,
         )

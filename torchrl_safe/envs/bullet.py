@@ -149,7 +149,8 @@ class World:
         # What can move is taken out of all contacts first: Bullet keeps contact points over a
         # restore, in an order that depends on what happened before.
         for index, body in enumerate(self._movable):
-            self._place(body, _limbo(index))
+            # Beside the obstacles that are not present.
+            self._place(body, _limbo(len(self._obstacles) + index))
         pybullet.performCollisionDetection(physicsClientId=client)
         pybullet.restoreState(self._home, physicsClientId=client)
         self._goal = goal.tolist()

@@ -43,6 +43,9 @@ class Sensing:
         tool: gives ``ee_position`` (m) and ``ee_velocity`` (m/s), each ``(N, s, 3)``.
         links: gives ``link_speed`` (m/s, ``(N, s, l)``), of every link's centre of mass.
 
+    Raises:
+        ValueError: if ``clearance`` is negative or not finite.
+
     Examples:
         >>> Sensing(clearance=0.1) | Sensing(clearance=0.3, joints=True)
         Sensing(clearance=0.3, table=False, itself=False, joints=True, tool=False, links=False)
@@ -54,6 +57,10 @@ class Sensing:
     joints: bool = False
     tool: bool = False
     links: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.clearance < np.inf:
+            raise ValueError(f"clearance must be finite and not negative, got {self.clearance}.")
 
     def __or__(self, other: Sensing) -> Sensing:
         return Sensing(
