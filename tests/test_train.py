@@ -12,7 +12,7 @@ from torchrl.checkpoint import Checkpoint
 
 from experiments.evaluation import mean, share
 from experiments.report import table
-from experiments.train import Config, make_agent
+from experiments.train import MULTIPLIER_RULES, Config, make_agent
 
 ROOT = Path(__file__).parent.parent
 
@@ -95,9 +95,19 @@ def test_help_names_the_options():
     assert done.returncode == 0
     for option in (
         "arm", "action", "algorithms", "cost-limit", "frames", "envs", "workers", "seed", "out",
-        "logger",
+        "logger", "multiplier-rule",
     ):  # fmt: skip
         assert f"--{option}" in done.stdout
+
+
+def test_multiplier_rules():
+    """An episode 2 above the limit: 0.1 times 2, with proportional control 5 times as much more."""
+    multiplier = {}
+    for name, rule in MULTIPLIER_RULES.items():
+        _, loss = make_agent(Config())
+        rule(loss, 1.0, 0.1).step(torch.tensor([[3.0]]))
+        multiplier[name] = loss.lagrange_multiplier.item()
+    assert multiplier == pytest.approx({"dual-ascent": 0.2, "pid": 1.2})
 
 
 @pytest.mark.parametrize(
