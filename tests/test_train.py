@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 from torchrl.checkpoint import Checkpoint
 
-from experiments.evaluation import mean, share
 from experiments.report import table
 from experiments.train import MULTIPLIER_RULES, Config, make_agent
 
@@ -127,14 +126,3 @@ def test_multiplier_rules():
 def test_bad_settings(settings, message):
     with pytest.raises(ValueError, match=message):
         Config(**settings)
-
-
-def test_intervals():
-    assert share(torch.tensor([True] * 9 + [False]))[0] == 0.9
-    # Wilson's interval of 9 successes in 10, from its closed form with z = 1.96.
-    assert share(torch.tensor([True] * 9 + [False]))[1:] == pytest.approx([0.596, 0.982], abs=1e-3)
-    estimate, low, high = mean(torch.tensor([0.0, 1.0] * 200))
-    assert estimate == 0.5
-    # The standard error is 0.5 / sqrt(400) = 0.025.
-    assert [low, high] == pytest.approx([0.451, 0.549], abs=6e-3)
-    assert mean(torch.zeros(50)) == [0, 0, 0]
