@@ -49,8 +49,8 @@ class PIDControl(MultiplierUpdater):
         ki (float): integral gain, in multiplier per unit of violated cost and batch.
         kd (float): derivative gain, in multiplier per unit of cost risen since the last batch.
         smoothing (float, optional): weight of the past in the moving average of the cost, from 0
-            up to but without 1; the average starts at the first batch. Defaults to ``0.0``, the
-            cost itself, as in algorithm 2.
+            up to but without 1. It starts at the first batch (algorithm 2 starts at 0, so that
+            the first batch counts as a rise). Defaults to ``0.0``, the cost itself, as there.
         max_multiplier (float, optional): see :class:`MultiplierUpdater`.
 
     Raises:
