@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
 import torch
-from scipy import stats
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_safe.metrics import mean, share, violation_rate
 
 
 @torch.no_grad()
@@ -57,28 +57,12 @@ def summarize(episodes: TensorDict, cost_names: tuple[str, ...]) -> dict[str, li
         cost_names: names of the columns of ``episode_cost``.
     """
     costs = episodes["episode_cost"]
-    summary = {
+    estimates = {
         "success": share(episodes["success"]),
         "return": mean(episodes["episode_reward"]),
         "steps": mean(episodes["steps"]),
     }
-    for name, column in zip(cost_names, costs.unbind(-1), strict=True):
-        summary[f"cost/{name}"] = mean(column)
-        summary[f"any/{name}"] = share(column > 0)
-    return summary
-
-
-def share(values: torch.Tensor) -> list[float]:
-    """Share of true values with Wilson's 95 % interval."""
-    test = stats.binomtest(int(values.sum()), values.numel())
-    interval = test.proportion_ci(method="wilson")
-    return [test.statistic, interval.low, interval.high]
-
-
-def mean(values: torch.Tensor) -> list[float]:
-    """Mean with the 95 % interval of the percentile bootstrap."""
-    sample = values.flatten().double().numpy()
-    interval = stats.bootstrap(
-        (sample,), np.mean, method="percentile", rng=np.random.default_rng(0)
-    ).confidence_interval
-    return [float(sample.mean()), float(interval.low), float(interval.high)]
+    for name, column in zip(cost_names, costs.split(1, -1), strict=True):
+        estimates[f"cost/{name}"] = mean(column)
+        estimates[f"any/{name}"] = violation_rate(column, 0.0)
+    return {name: torch.cat(estimate).tolist() for name, estimate in estimates.items()}

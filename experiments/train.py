@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
@@ -52,7 +52,7 @@ from torchrl_safe.envs import (
     Obstacles,
     Scattered,
 )
-from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
+from torchrl_safe.objectives import DualAscent, MultiplierUpdater, PIDControl, PPOLagrangianLoss
 
 ARMS = {"panda": PANDA, "iiwa": IIWA, "xarm6": XARM6, "xarm7": XARM7, "ur5": UR5, "ur10": UR10}
 OBSTACLES: dict[str, Obstacles] = {
@@ -64,6 +64,14 @@ OBSTACLES: dict[str, Obstacles] = {
 }
 ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointDelta()}
 COSTS = {"collision": Collision()}
+# Called as rule(loss, limit, rate). The gains stand to each other as in
+# tests/test_constrained_optimum.py.
+MULTIPLIER_RULES: dict[str, Callable[[PPOLagrangianLoss, float, float], MultiplierUpdater]] = {
+    "dual-ascent": lambda loss, limit, rate: DualAscent(loss, cost_limit=limit, lr=rate),
+    "pid": lambda loss, limit, rate: PIDControl(
+        loss, cost_limit=limit, kp=5 * rate, ki=rate, kd=5 * rate, smoothing=0.5
+    ),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,8 +114,11 @@ class Config:
     """Adam's learning rate at the start, of all three networks; it falls linearly to 0."""
     gamma: float = 0.97
     """Discount of reward and cost."""
+    multiplier_rule: Literal["dual-ascent", "pid"] = "dual-ascent"
+    """What moves the multiplier: the violations added up, or also the last one and its rise."""
     multiplier_rate: float = 0.2
-    """Multiplier added for each unit of violated cost, once a batch."""
+    """Multiplier added for each unit of violated cost, once a batch; the integral gain of pid,
+    whose other two gains are five times as large."""
     margin: float = 0.4
     """Share of the cost limit held back in training. A limit that binds is met on average only:
     policies trained for exactly the limit are found above it about as often as below."""
@@ -208,7 +219,7 @@ def train(config: Config, algorithm: str) -> tuple[ProbabilisticActor, list[dict
     torch.manual_seed(config.seed)
     actor, loss = make_agent(config)
     target = (1 - config.margin) * config.cost_limit
-    updater = DualAscent(loss, cost_limit=target, lr=config.multiplier_rate)
+    updater = MULTIPLIER_RULES[config.multiplier_rule](loss, target, config.multiplier_rate)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate)
     batches = math.ceil(config.frames / config.frames_per_batch)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=batches)

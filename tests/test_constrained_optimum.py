@@ -22,6 +22,7 @@ complementary slackness its multiplier is 0.
 
 import math
 import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -33,7 +34,7 @@ from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 from torchrl.envs import EnvBase
 from torchrl.modules import OneHotCategorical, ProbabilisticActor, ValueOperator
 
-from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
+from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss
 
 with warnings.catch_warnings():  # TorchRL 0.14 deprecates a base class that it still derives from.
     warnings.filterwarnings("ignore", "Creating .* WeightUpdaterBase", DeprecationWarning)
@@ -73,8 +74,8 @@ class TwoActions(EnvBase):
         torch.manual_seed(seed)
 
 
-def train(seed, multiplier_lr, batches):
-    """Share of action A and multipliers, batch by batch."""
+def train(seed, rule, batches):
+    """Share of action A and multipliers, batch by batch; without a rule they stay at 0."""
     torch.manual_seed(seed)
     actor = ProbabilisticActor(
         TensorDictModule(nn.Linear(1, 2), ["observation"], ["logits"]),
@@ -85,9 +86,7 @@ def train(seed, multiplier_lr, batches):
     critic = ValueOperator(nn.Linear(1, 1), in_keys=["observation"])
     cost_critic = ValueOperator(nn.Linear(1, 2), in_keys=["observation"], out_keys=["cost_value"])
     loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=2, entropy_bonus=False)
-    updater = None
-    if multiplier_lr:
-        updater = DualAscent(loss, cost_limit=torch.tensor([LIMIT, 0.9]), lr=multiplier_lr)
+    updater = rule(loss, cost_limit=torch.tensor([LIMIT, 0.9])) if rule else None
     optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
     collector = Collector(
         TwoActions(),
@@ -117,8 +116,20 @@ def train(seed, multiplier_lr, batches):
     return torch.stack(shares), torch.stack(multipliers)
 
 
-def test_policy_and_multipliers_reach_the_optimum():
-    shares, multipliers = train(seed=0, multiplier_lr=1.0, batches=240)
+RULES = {
+    "dual-ascent": partial(DualAscent, lr=1.0),
+    "pid": partial(PIDControl, kp=5.0, ki=1.0, kd=5.0, smoothing=0.5),
+}
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return {name: train(seed=0, rule=rule, batches=240) for name, rule in RULES.items()}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_policy_and_multipliers_reach_the_optimum(trained, rule):
+    shares, multipliers = trained[rule]
     # Ascent on the multiplier and descent on the policy circle inwards, so the means of the last
     # third are compared; over ten seeds they stayed within half of these tolerances.
     share, multiplier = shares[-80:].mean(), multipliers[-80:].mean(0)
@@ -127,7 +138,24 @@ def test_policy_and_multipliers_reach_the_optimum():
     assert multiplier[1].item() == pytest.approx(0.0, abs=1e-3)
 
 
+def test_pid_control_damps_the_circling(trained):
+    """Against dual ascent with the same integral gain, in the share of action A, here the cost.
+
+    Means (and standard deviations) over ten seeds, dual ascent and PID control: swing below the
+    limit 0.235 (0.014) and 0.093 (0.039), and above it again 0.280 (0.038) and 0.064 (0.007);
+    excess summed over all batches 12.5 (2.3) and 5.0 (0.9). 512 episodes a batch make 0.02 of
+    noise.
+    """
+    below, above, total = {}, {}, {}
+    for name, (shares, _) in trained.items():
+        excess = shares - LIMIT
+        after = excess[(excess <= 0).int().argmax() :]
+        below[name], above[name], total[name] = -after.min(), after.max(), excess.relu().sum()
+    for swing in (below, above, total):
+        assert swing["pid"] < 0.6 * swing["dual-ascent"]
+
+
 def test_without_the_multiplier_the_limit_is_exceeded():
-    shares, multipliers = train(seed=0, multiplier_lr=0.0, batches=60)
+    shares, multipliers = train(seed=0, rule=None, batches=60)
     assert shares[-20:].mean() > 0.95
     assert (multipliers == 0).all()

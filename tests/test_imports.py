@@ -12,18 +12,38 @@ import torchrl_safe
 PACKAGE = Path(torchrl_safe.__file__).parent
 
 
-def test_the_losses_need_no_simulator():
+def load(package):
+    """Names of our modules and PyBullet's that one import loads in a new process."""
     code = (
-        "import sys, torchrl_safe.objectives\n"
+        f"import sys, {package}\n"
         "print(*(n for n in sys.modules if n.split('.')[0] == 'pybullet'\n"
         "        or n.startswith(('pybullet', 'torchrl_safe.'))))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
     )
-    loaded = set(done.stdout.split())
+    return set(done.stdout.split())
+
+
+def test_the_losses_need_no_simulator():
+    loaded = load("torchrl_safe.objectives")
     assert "torchrl_safe.objectives.ppo_lagrangian" in loaded
     assert {name for name in loaded if not name.startswith("torchrl_safe.objectives")} == set()
+
+
+def test_the_metrics_need_neither_simulator_nor_environments_nor_losses():
+    assert load("torchrl_safe.metrics") == {"torchrl_safe.metrics"}
+
+
+def test_the_metrics_say_what_they_need():
+    code = "import sys; sys.modules['scipy'] = None; import torchrl_safe.metrics"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode != 0
+    assert 'ImportError: torchrl_safe.metrics needs SciPy: pip install "torchrl-safe[metrics]"' in (
+        done.stderr
+    )
 
 
 def imported_modules(path):

@@ -10,9 +10,8 @@ import torch
 from PIL import Image
 from torchrl.checkpoint import Checkpoint
 
-from experiments.evaluation import mean, share
 from experiments.report import table
-from experiments.train import Config, make_agent
+from experiments.train import MULTIPLIER_RULES, Config, make_agent
 
 ROOT = Path(__file__).parent.parent
 
@@ -95,9 +94,19 @@ def test_help_names_the_options():
     assert done.returncode == 0
     for option in (
         "arm", "action", "algorithms", "cost-limit", "frames", "envs", "workers", "seed", "out",
-        "logger",
+        "logger", "multiplier-rule",
     ):  # fmt: skip
         assert f"--{option}" in done.stdout
+
+
+def test_multiplier_rules():
+    """An episode 2 above the limit: 0.1 times 2, with proportional control 5 times as much more."""
+    multiplier = {}
+    for name, rule in MULTIPLIER_RULES.items():
+        _, loss = make_agent(Config())
+        rule(loss, 1.0, 0.1).step(torch.tensor([[3.0]]))
+        multiplier[name] = loss.lagrange_multiplier.item()
+    assert multiplier == pytest.approx({"dual-ascent": 0.2, "pid": 1.2})
 
 
 @pytest.mark.parametrize(
@@ -117,14 +126,3 @@ def test_help_names_the_options():
 def test_bad_settings(settings, message):
     with pytest.raises(ValueError, match=message):
         Config(**settings)
-
-
-def test_intervals():
-    assert share(torch.tensor([True] * 9 + [False]))[0] == 0.9
-    # Wilson's interval of 9 successes in 10, from its closed form with z = 1.96.
-    assert share(torch.tensor([True] * 9 + [False]))[1:] == pytest.approx([0.596, 0.982], abs=1e-3)
-    estimate, low, high = mean(torch.tensor([0.0, 1.0] * 200))
-    assert estimate == 0.5
-    # The standard error is 0.5 / sqrt(400) = 0.025.
-    assert [low, high] == pytest.approx([0.451, 0.549], abs=6e-3)
-    assert mean(torch.zeros(50)) == [0, 0, 0]
