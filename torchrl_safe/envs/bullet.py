@@ -30,9 +30,6 @@ _LIMBO = (0.0, 0.0, -100.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _AT_REST = (0.0, 0.0, 0.0)
 _Vector = Sequence[float]
-# Detections of collisions for each body that can move, until all its pairs are forgotten. Two were
-# enough for seven bodies.
-_DETECTIONS = 4
 
 
 class World:
@@ -115,6 +112,11 @@ class World:
         self._movable = [body for body, fixed in bodies if not fixed] + self._objects
         if self._brick is not None:
             self._movable.append(self._brick)
+        if self._movable:
+            # Bullet solves bodies that are, or once were, near each other together, with as many
+            # iterations as the slowest needs. Only if all take the same number does the past not
+            # show in the last bits of what is to come.
+            pybullet.setPhysicsEngineParameter(solverResidualThreshold=0, physicsClientId=client)
         # Bullet restores a state bit for bit only if it was saved after a first step.
         pybullet.stepSimulation(physicsClientId=client)
         fingers = [arm.finger_home] * len(self._arm.fingers)
@@ -149,7 +151,12 @@ class World:
     def reset(self, placement: Placement, goal: Array, objects: Array) -> None:
         """Puts the arm at home, obstacles and objects in their places, the target at ``goal``."""
         client = self._client
-        self._forget_contacts()
+        # What can move is taken out of all contacts first, beside the obstacles that are not
+        # present: Bullet keeps contact points over a restore, in an order that depends on what
+        # happened before.
+        for index, body in enumerate(self._movable):
+            self._place(body, _limbo(len(self._obstacles) + index))
+        pybullet.performCollisionDetection(physicsClientId=client)
         pybullet.restoreState(self._home, physicsClientId=client)
         self._goal = goal.tolist()
         self._present = np.flatnonzero(placement.present).tolist()
@@ -166,21 +173,6 @@ class World:
         for target in (self._brick, self._marker):
             if target is not None:
                 self._place(target, self._goal)
-
-    def _forget_contacts(self) -> None:
-        """Takes what can move out of all contacts.
-
-        Over a restore Bullet keeps its list of pairs of bodies that are near each other. Bodies
-        in a pair are solved together, with a number of iterations that depends on both, so that
-        a pair from the past changes the last bits of what is to come. Each detection of collisions
-        drops only a few of the pairs that have come apart, and only if something has moved.
-        """
-        first = len(self._obstacles)  # Beside the obstacles that are not present.
-        for turn in range(max(1, _DETECTIONS * len(self._movable))):
-            for index, body in enumerate(self._movable):
-                x, y, z = _limbo(first + index)
-                self._place(body, (x, y, z + turn % 2))
-            pybullet.performCollisionDetection(physicsClientId=self._client)
 
     def _look_ahead(self, substeps: int) -> list[tuple[list[_Vector], ...]]:
         """The obstacles' ways through the next substeps.
