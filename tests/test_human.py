@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from worlds import each_arm, rest, turn
 
-from torchrl_safe.envs import ArmEnv, Capsule, Collision, Human, Region
+from torchrl_safe.envs import ArmEnv, Capsule, Collision, Human, Region, Sphere
 
 RATE = 240
 START, GOAL = np.array([0.35, 0.0, 0.2]), np.array([0.65, 0.1, 0.1])
@@ -36,7 +36,7 @@ def test_the_arm_hangs_together(human, seed):
     np.testing.assert_allclose(shoulder, np.broadcast_to(human.shoulder, shoulder.shape), atol=1e-9)
     np.testing.assert_allclose(elbow, below_elbow, atol=1e-9)
     np.testing.assert_allclose(head, np.broadcast_to(head[0], head.shape))
-    assert [type(shape) for shape in human.shapes] == [Capsule] * 3
+    assert [type(shape) for shape in human.shapes] == [Capsule, Capsule, Sphere]
     for joint, shape in ((elbow, human.shapes[0]), (hand, human.shapes[1])):
         assert (joint[:, 2] > shape.radius).all()
 

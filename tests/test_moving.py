@@ -23,11 +23,33 @@ from torchrl_safe.envs import (
 
 RATE = 240
 START, GOAL = np.array([0.3, 0, 0.2]), np.ones(3)
+ACROSS = np.array([0.6, 0.8, 0.0])
 SIDEWAYS = [[0.0, 0.0, np.sin(0.4), np.cos(0.4)]] * 2
 
 
 def draw(motion, seed=0):
-    return motion.sample(np.random.default_rng(seed))
+    return motion.sample(np.random.default_rng(seed), ACROSS)
+
+
+@pytest.mark.parametrize("motion", [Swing(), Patrol()], ids=lambda value: type(value).__name__)
+def test_without_a_direction_the_motion_is_across(motion):
+    way = draw(motion)(np.arange(0, 3, 1 / RATE))
+    np.testing.assert_allclose(way, (way @ ACROSS)[:, None] * ACROSS, atol=1e-12)
+    assert np.ptp(way @ ACROSS) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("goal", "across"),
+    [((0.3, 0.5, 0.7), (1, 0)), ((0.9, 0.8, 0.1), (-0.8, 0.6)), ((0.3, 0, 0.9), (0, 1))],
+    ids=["to-the-left", "aslant", "straight-up"],
+)
+def test_obstacles_move_across_the_way_from_start_to_goal(goal, across):
+    layout = Moving(Places(Sphere(), at=[(0.7, 0, 0.4)]), Swing())
+    placement = layout.sample(np.random.default_rng(0), START, np.array(goal))
+    way = np.diff(placement.at(np.arange(0, 1, 1 / RATE))[0][:, 0], axis=0)
+    assert np.abs(way).max() > 0
+    np.testing.assert_allclose(way[:, :2] @ [across[1], -across[0]], 0, atol=1e-12)
+    np.testing.assert_array_equal(way[:, 2], 0)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -67,13 +89,13 @@ def test_patrol(seed):
 @pytest.mark.parametrize("motion", [Swing(), Patrol()], ids=lambda value: type(value).__name__)
 def test_the_start_is_random(motion):
     assert isinstance(motion, Motion)
-    starts = np.array([draw(motion, seed)(np.zeros(1))[0, 1] for seed in range(200)])
+    starts = np.array([draw(motion, seed)(np.zeros(1))[0] @ ACROSS for seed in range(200)])
     half = 0.1 if isinstance(motion, Swing) else 0.15
     assert starts.min() < -0.9 * half
     assert starts.max() > 0.9 * half
     assert abs(np.mean(starts)) < 0.2 * half
     # Either way.
-    ahead = np.array([draw(motion, seed)(np.array([0.0, 0.01]))[:, 1] for seed in range(200)])
+    ahead = np.array([draw(motion, seed)(np.array([0.0, 0.01])) @ ACROSS for seed in range(200)])
     assert 60 < (np.diff(ahead) > 0).sum() < 140
     np.testing.assert_array_equal(draw(motion, 7)(np.ones(1)), draw(motion, 7)(np.ones(1)))
 

@@ -92,7 +92,8 @@ def test_fingers_hold_by_friction(make_env, arm):
     success, *_ = fly(env, shake, steps=110)
     assert not success.any()
     assert len(held) == 16
-    assert np.ptp(held, axis=0).max() < 5e-3
+    # Of the 20 mm between its middle and where it would fall.
+    assert np.ptp(held, axis=0).max() < 8e-3
 
 
 def _finger_forces(env, row):
