@@ -81,3 +81,9 @@ def test_environments_and_losses_are_apart(importer, forbidden):
         for name in names
         if is_in(name, forbidden)
     }
+
+
+def test_three_files_talk_to_pybullet():
+    sources = (PACKAGE / "envs").rglob("*.py")
+    users = {path.name for path in sources if "pybullet" in set(imported_modules(path))}
+    assert users == {"bullet.py", "bodies.py", "sensors.py"}

@@ -1,4 +1,4 @@
-"""One simulated world. With ``bodies.py`` the only file that talks to PyBullet."""
+"""One simulated world. With ``bodies.py`` and ``sensors.py`` all that talks to PyBullet."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from torchrl_safe.envs.bodies import (
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.rotations import rotation_vector
 from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
+from torchrl_safe.envs.sensors import MovingBody, Sensors, Vector, link_state, velocity_at
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import Array, Sensing
 
@@ -29,7 +30,6 @@ _RED, _YELLOW, _BLUE = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.15, 0.4,
 _LIMBO = (0.0, 0.0, -100.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _AT_REST = (0.0, 0.0, 0.0)
-_Vector = Sequence[float]
 
 
 class World:
@@ -66,9 +66,8 @@ class World:
         # PyBullet reuses client numbers: each is disconnected once, by its owner.
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
         self._scene = scene
-        self._sensing = sensing
         try:
-            self._build(arm, shapes, objects, visuals=visuals or gui)
+            self._build(arm, shapes, objects, sensing, visuals=visuals or gui)
         except BaseException:
             self.close()
             raise
@@ -86,16 +85,21 @@ class World:
         )
 
     def _build(
-        self, arm: ArmModel, shapes: Sequence[Shape], objects: Sequence[Shape], *, visuals: bool
+        self,
+        arm: ArmModel,
+        shapes: Sequence[Shape],
+        objects: Sequence[Shape],
+        sensing: Sensing,
+        *,
+        visuals: bool,
     ) -> None:
         client, scene = self._client, self._scene
         pybullet.setGravity(0, 0, -scene.gravity, physicsClientId=client)
         # Contacts then do not depend on the order in which bodies came close.
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        self._furniture = load_furniture(client, scene, visuals=visuals)
-        self._arm = load_arm(
-            client, arm, scene, visuals=visuals, self_collision=self._sensing.itself
-        )
+        furniture = load_furniture(client, scene, visuals=visuals)
+        self._arm = load_arm(client, arm, scene, visuals=visuals, self_collision=sensing.itself)
+        self._sensors = Sensors(client, self._arm, furniture, len(shapes), sensing)
         red, blue = (_RED, _BLUE) if visuals else (None, None)
         self._obstacles = [
             add_shape(client, shape, _limbo(index), red) for index, shape in enumerate(shapes)
@@ -121,15 +125,15 @@ class World:
         pybullet.stepSimulation(physicsClientId=client)
         fingers = [arm.finger_home] * len(self._arm.fingers)
         self._set_joints([*arm.home, *fingers])
-        if self._sensing.itself:
+        if sensing.itself:
             self._allow_overlaps()
         self._home = pybullet.saveState(physicsClientId=client)
-        self._goal: _Vector = _LIMBO
+        self._goal: Vector = _LIMBO
         self._present: list[int] = []
-        self._poses: list[tuple[_Vector, _Vector]] = [
+        self._poses: list[tuple[Vector, Vector]] = [
             (_limbo(index), _UPRIGHT) for index in range(len(shapes))
         ]
-        self._velocities: list[tuple[_Vector, _Vector]] = [(_AT_REST, _AT_REST)] * len(shapes)
+        self._velocities: list[tuple[Vector, Vector]] = [(_AT_REST, _AT_REST)] * len(shapes)
         link = self._link_state(fresh=True)
         #: Tool point, m, and tool orientation, a quaternion (x, y, z, w), at home.
         self.home_position, self.home_orientation = link[4], link[5]
@@ -174,7 +178,7 @@ class World:
             if target is not None:
                 self._place(target, self._goal)
 
-    def _look_ahead(self, substeps: int) -> list[tuple[list[_Vector], ...]]:
+    def _look_ahead(self, substeps: int) -> list[tuple[list[Vector], ...]]:
         """The obstacles' ways through the next substeps.
 
         Returns:
@@ -191,10 +195,10 @@ class World:
 
     def _follow(
         self,
-        positions: list[_Vector],
-        orientations: list[_Vector],
-        velocities: list[_Vector],
-        spins: list[_Vector],
+        positions: list[Vector],
+        orientations: list[Vector],
+        velocities: list[Vector],
+        spins: list[Vector],
     ) -> None:
         """Puts the obstacles where their ways lead."""
         for index in self._present:
@@ -203,7 +207,7 @@ class World:
             self._place(self._obstacles[index], *self._poses[index])
 
     def advance(
-        self, joint_target: _Vector, finger_target: _Vector, substeps: int
+        self, joint_target: Vector, finger_target: Vector, substeps: int
     ) -> tuple[list[float], list[float], list[list[float]]]:
         """Drives the joints towards a target for some physics substeps.
 
@@ -218,7 +222,7 @@ class World:
         forces = [0.0] * len(self._obstacles)
         measurements = []
         ways = None if self._placement.path is None else self._look_ahead(substeps)
-        senses = self._sensing != Sensing()
+        senses = self._sensors.sensing != Sensing()
         for substep in range(substeps):
             if ways is not None:
                 self._follow(*ways[substep + 1])
@@ -236,7 +240,7 @@ class World:
         self._substeps += substeps
         return distances, forces, measurements
 
-    def _command(self, joint_target: _Vector, finger_target: _Vector, gain: float) -> None:
+    def _command(self, joint_target: Vector, finger_target: Vector, gain: float) -> None:
         targets = [*joint_target, *finger_target]
         count = len(targets)
         limits = {"forces": self._arm.effort[:count]} if self._scene.motor_limits else {}
@@ -261,7 +265,7 @@ class World:
             *(state[0] for state in states[arm:]),
             *link[4],
             *link[5],
-            *_velocity_at(link[4], link[0], link[6], link[7]),
+            *velocity_at(link[4], link[0], link[6], link[7]),
         ]
         row += self._goal if self._brick is None else self._pose(self._brick)[0]
         objects = [(*self._pose(body), *self._velocity(body)) for body in self._objects]
@@ -296,86 +300,24 @@ class World:
         """Returns what ``sensing`` asks for as a flat row, in the order of :meth:`trace_shapes`.
 
         Args:
-            touches: read contact points. They are those of the last substep, also after a reset.
+            touches: read contact points, which are those of the last substep.
         """
-        sensing, client, row = self._sensing, self._client, []
-        if sensing.clearance:
-            nearest = [self._nearest(index) for index in range(len(self._obstacles))]
-            row = [part for parts in zip(*nearest, strict=True) for part in parts]
-        if sensing.table:
-            row.append(self._touch(self._furniture) if touches else math.inf)
-        if sensing.itself:
-            row.append(self._touch([self._arm.body]) if touches else math.inf)
-        if sensing.joints:
-            row += [state[0] for state in self._joint_states()[: len(self._arm.joints)]]
-        if sensing.tool:
-            link = self._link_state(fresh=True)
-            row += [*link[4], *_velocity_at(link[4], link[0], link[6], link[7])]
-        if sensing.links:
-            body = self._arm.body
-            links = range(pybullet.getNumJoints(body, physicsClientId=client))
-            states = pybullet.getLinkStates(
-                body, links, computeLinkVelocity=1, physicsClientId=client
+        indices = range(len(self._obstacles)) if self._sensors.sensing.clearance else ()
+        obstacles = [
+            MovingBody(
+                self._obstacles[index],
+                self._obstacle_pose(index)[0],
+                *self._obstacle_velocity(index),
             )
-            row += [math.hypot(*state[6]) for state in states]
-        return row
+            if index in self._present
+            else None
+            for index in indices
+        ]
+        return self._sensors.read(obstacles, touches=touches)
 
     def trace_shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the parts of a row that :meth:`measure` returns."""
-        sensing, obstacles = self._sensing, len(self._obstacles)
-        shapes: dict[str, tuple[int, ...]] = {}
-        if sensing.clearance:
-            names = ("clearance", "arm_approach", "obstacle_approach")
-            shapes |= dict.fromkeys(names, (obstacles,))
-        if sensing.table:
-            shapes["table_distance"] = ()
-        if sensing.itself:
-            shapes["self_distance"] = ()
-        if sensing.joints:
-            shapes["joint_position"] = (len(self._arm.joints),)
-        if sensing.tool:
-            shapes |= {"ee_position": (3,), "ee_velocity": (3,)}
-        if sensing.links:
-            links = pybullet.getNumJoints(self._arm.body, physicsClientId=self._client)
-            shapes["link_speed"] = (links,)
-        return shapes
-
-    def _nearest(self, index: int) -> tuple[float, float, float]:
-        """Distance of arm and obstacle, and the speeds of their closest points to each other."""
-        client, arm = self._client, self._arm.body
-        points = index in self._present and pybullet.getClosestPoints(
-            arm, self._obstacles[index], self._sensing.clearance, physicsClientId=client
-        )
-        if not points:
-            return math.inf, 0.0, 0.0
-        point = min(points, key=lambda point: point[8])
-        link, on_arm, on_obstacle, normal = point[3], point[5], point[6], point[7]
-        arm_velocity: _Vector = _AT_REST
-        if link >= 0:
-            state = pybullet.getLinkState(
-                arm, link, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=client
-            )
-            arm_velocity = _velocity_at(on_arm, state[0], state[6], state[7])
-        centre = self._obstacle_pose(index)[0]
-        obstacle_velocity = _velocity_at(on_obstacle, centre, *self._obstacle_velocity(index))
-        # The normal points from the obstacle to the arm.
-        return point[8], -_dot(arm_velocity, normal), _dot(obstacle_velocity, normal)
-
-    def _touch(self, bodies: Sequence[int]) -> float:
-        """Smallest distance among the contact points of what moves of the arm with bodies."""
-        base = self._arm.base
-        return min(
-            (
-                point[8]
-                for body in bodies
-                for point in pybullet.getContactPoints(
-                    self._arm.body, body, physicsClientId=self._client
-                )
-                # Of two links of the arm, one may be the base.
-                if point[3] not in base or (body == self._arm.body and point[4] not in base)
-            ),
-            default=math.inf,
-        )
+        return self._sensors.shapes()
 
     def clearance(self) -> float:
         """Returns the smallest distance between arm and obstacles, up to 0.1 m."""
@@ -388,13 +330,13 @@ class World:
         ]
         return min(points, default=0.1)
 
-    def tool_at(self, joint_position: _Vector) -> tuple[_Vector, _Vector]:
+    def tool_at(self, joint_position: Vector) -> tuple[Vector, Vector]:
         """Moves the arm at once; returns tool point and orientation. To be reset afterwards."""
         self._set_joints([*joint_position, *(0.0 for _ in self._arm.fingers)])
         link = self._link_state(fresh=True)
         return link[4], link[5]
 
-    def jacobian(self, joint_position: _Vector) -> tuple[_Vector, ...]:
+    def jacobian(self, joint_position: Vector) -> tuple[Vector, ...]:
         """Returns the six rows of the tool point's Jacobian: linear, then angular velocity."""
         arm = self._arm
         position = [0.0] * arm.num_movable
@@ -409,7 +351,7 @@ class World:
             return (*linear, *angular)
         return tuple([row[c] for c in arm.columns] for row in (*linear, *angular))
 
-    def inverse_kinematics(self, position: _Vector, orientation: _Vector) -> list[float]:
+    def inverse_kinematics(self, position: Vector, orientation: Vector) -> list[float]:
         """Returns the joint angles of Bullet's iterative solver, its default 20 iterations."""
         angles = pybullet.calculateInverseKinematics(
             self._arm.body, self._arm.ee, position, orientation, physicsClientId=self._client
@@ -446,20 +388,14 @@ class World:
         return np.asarray(pixels, np.uint8).reshape(height, width, 4)[..., :3]
 
     def _link_state(self, *, fresh: bool) -> tuple:
-        return pybullet.getLinkState(
-            self._arm.body,
-            self._arm.ee,
-            computeLinkVelocity=1,
-            computeForwardKinematics=int(fresh),
-            physicsClientId=self._client,
-        )
+        return link_state(self._client, self._arm.body, self._arm.ee, fresh=fresh)
 
     def _joint_states(self) -> tuple[tuple[float, float], ...]:
         return pybullet.getJointStates(
             self._arm.body, self._arm.joints + self._arm.fingers, physicsClientId=self._client
         )
 
-    def _set_joints(self, positions: _Vector) -> None:
+    def _set_joints(self, positions: Vector) -> None:
         pybullet.resetJointStatesMultiDof(
             self._arm.body,
             self._arm.joints + self._arm.fingers,
@@ -468,26 +404,26 @@ class World:
             physicsClientId=self._client,
         )
 
-    def _place(self, body: int, position: _Vector, orientation: _Vector = _UPRIGHT) -> None:
+    def _place(self, body: int, position: Vector, orientation: Vector = _UPRIGHT) -> None:
         pybullet.resetBasePositionAndOrientation(
             body, position, orientation, physicsClientId=self._client
         )
 
-    def _pose(self, body: int) -> tuple[_Vector, _Vector]:
+    def _pose(self, body: int) -> tuple[Vector, Vector]:
         return pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
 
-    def _velocity(self, body: int) -> tuple[_Vector, _Vector]:
+    def _velocity(self, body: int) -> tuple[Vector, Vector]:
         return pybullet.getBaseVelocity(body, physicsClientId=self._client)
 
     def _is_simulated(self, index: int) -> bool:
         # What is not present falls for ever, which nobody wants to know.
         return not self._is_fixed[index] and index in self._present
 
-    def _obstacle_pose(self, index: int) -> tuple[_Vector, _Vector]:
+    def _obstacle_pose(self, index: int) -> tuple[Vector, Vector]:
         simulated = self._is_simulated(index)
         return self._pose(self._obstacles[index]) if simulated else self._poses[index]
 
-    def _obstacle_velocity(self, index: int) -> tuple[_Vector, _Vector]:
+    def _obstacle_velocity(self, index: int) -> tuple[Vector, Vector]:
         simulated = self._is_simulated(index)
         return self._velocity(self._obstacles[index]) if simulated else self._velocities[index]
 
@@ -498,20 +434,3 @@ _BODY_PARTS = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity
 def _limbo(index: int) -> tuple[float, float, float]:
     """Out of the world, and out of the way of whatever else is there."""
     return (10.0 * index, 0.0, -100.0)
-
-
-def _dot(first: _Vector, second: _Vector) -> float:
-    return sum(a * b for a, b in zip(first, second, strict=True))
-
-
-def _velocity_at(
-    point: _Vector, centre: _Vector, linear: _Vector, angular: _Vector
-) -> tuple[float, float, float]:
-    """Velocity of a point of a body whose centre of mass has the given velocities."""
-    x, y, z = (p - c for p, c in zip(point, centre, strict=True))
-    wx, wy, wz = angular
-    return (
-        linear[0] + wy * z - wz * y,
-        linear[1] + wz * x - wx * z,
-        linear[2] + wx * y - wy * x,
-    )
