@@ -30,6 +30,7 @@ from torchrl_safe.envs import (
     PickAndPlace,
     Push,
     Reach,
+    Scattered,
 )
 
 PILOTS = {
@@ -68,6 +69,15 @@ def test_success_costs_nothing(make_env, arm, task):
     assert success.all()
     assert not cost.any()
     assert (fly(env, careless, steps=100)[2] > 0).all()
+
+
+@each_arm
+def test_scattered_obstacles_leave_a_way_to_the_goal(make_env, arm):
+    layout = Scattered(fewest=0)
+    env = make_env(ArmEnv, arm, num_envs=8, seed=0, obstacles=layout, max_episode_steps=60)
+    success, _, cost = fly(env, over)
+    assert success.all()
+    assert not cost.any()
 
 
 @pytest.mark.parametrize("arm", [PANDA, UR5], ids=["panda", "ur5"])
