@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow gallery lint format type clean
+.PHONY: train test test-slow paper gallery lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -17,13 +17,16 @@ test: $(READY)  ## everything but the slow tests, on two cores
 test-slow: $(READY)  ## the tests that train for minutes
 	$(BIN)/pytest -m slow $(ARGS)
 
+paper: $(READY)  ## Table 1 and Figure 2 of the paper, run again; goes on where it was stopped
+	$(BIN)/python -m experiments.paper $(ARGS)
+
 gallery: $(READY)  ## the contact sheet of docs/environments.md
 	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/codespell torchrl_safe experiments tests tutorials *.md
+	$(BIN)/codespell torchrl_safe experiments tests tutorials docs *.md
 
 format: $(READY)
 	$(BIN)/ruff check --fix .

@@ -220,18 +220,16 @@ def table(runs: list[dict[str, Any]]) -> str:
     ]
     for cell in CELLS:
         mine = [run for run in runs if run["cell"] == cell]
-        average = [np.nanmean(per_epoch(run, "cost")) for run in mine]
-        late = [np.nanmean(per_epoch(run, "success")[-_LATE:]) for run in mine]
+        average = [_mean(per_epoch(run, "cost")) for run in mine]
+        late = [_mean(per_epoch(run, "success")[-_LATE:]) for run in mine]
         test = {
             name: [run["evaluation"][name] for run in mine]
             for name in ("success", "cost", "touched")
         }
         lines.append(
             f"| {cell} | {_spread(*PAPER[cell])} | {_spread(*RERUN[cell])} "
-            f"| {_spread(np.mean(average), np.std(average))} | {RERUN_SUCCESS[cell]:.2f} "
-            f"| {_spread(np.mean(late), np.std(late), 2)} "
-            f"| {_spread(np.mean(test['success']), np.std(test['success']), 2)} "
-            f"| {_spread(np.mean(test['cost']), np.std(test['cost']))} "
+            f"| {_over_seeds(average)} | {RERUN_SUCCESS[cell]:.2f} | {_over_seeds(late, 2)} "
+            f"| {_over_seeds(test['success'], 2)} | {_over_seeds(test['cost'])} "
             f"| {np.mean(test['touched']):.0%} |"
         )
     return "\n".join(lines)
@@ -283,18 +281,23 @@ def main(config: Config) -> None:
     print(f"\n{table(runs)}\nResults are in {config.out}.")
 
 
+def _over_seeds(values: list[float], digits: int = 1) -> str:
+    return _spread(float(np.mean(values)), float(np.std(values)), digits)
+
+
 def _spread(mean: float, deviation: float, digits: int = 1) -> str:
     return f"{mean:.{digits}f} ± {deviation:.{digits}f}"
 
 
 def _smooth(values: np.ndarray, width: int = 10) -> np.ndarray:
     """Running mean over epochs, of what there is."""
-    return np.array(
-        [
-            np.nanmean(part) if np.isfinite(part).any() else np.nan
-            for part in (values[max(0, end - width) : end] for end in range(1, len(values) + 1))
-        ]
-    )
+    ends = range(1, len(values) + 1)
+    return np.array([_mean(values[max(0, end - width) : end]) for end in ends])
+
+
+def _mean(values: np.ndarray) -> float:
+    """Mean of what is not NaN, if there is any."""
+    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
 if __name__ == "__main__":
