@@ -335,3 +335,19 @@ def test_fingers_open_and_close(make_env, arm, mode):
 def test_widths(mode, width):
     assert mode.width(num_joints=6) == width
     assert mode.moves_fingers == (mode.finger_step is not None)
+
+
+def test_yaw_of_a_tool_that_points_up(make_env):
+    """How far it is turned about the vertical is not defined then, but there is a way back."""
+    action = CartesianDelta(yaw_step=0.1)
+    down = np.array([[1.0, 0.0, 0.0, 0.0]])
+    world = SimpleNamespace(home_orientation=down[0])
+    state = make_state(ee_orientation=[[0.0, 0.0, 0.0, 1.0]] * 2)
+    wanted = action._orientation(np.zeros((2, 4)), state, np.asarray(world.home_orientation))
+    np.testing.assert_allclose(wanted, np.repeat(down, 2, axis=0))
+
+
+def test_orientation_may_be_an_array(make_env):
+    wanted = np.array([1.0, 0.0, 0.0, 0.0])
+    env = make_env(ArmEnv, action=CartesianDelta(orientation=wanted))
+    assert env.rollout(2)["next", "reward"].isfinite().all()

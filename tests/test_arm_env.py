@@ -17,13 +17,16 @@ from torchrl.record import PixelRenderTransform
 from torchrl_safe.envs import (
     PANDA,
     ArmEnv,
+    Camera,
     CartesianDelta,
     Collision,
     Cylinder,
+    FullObservation,
     InFront,
     JointDelta,
     NoObstacles,
     Placement,
+    Push,
     Reach,
     Region,
     Scene,
@@ -383,7 +386,11 @@ class Task(Reach):
         ({"num_envs": True}, "num_envs must be a whole number of at least 1, got True"),
         ({"frame_skip": 2.5}, "frame_skip must be a whole number of at least 1, got 2.5"),
         ({"max_episode_steps": -1}, "max_episode_steps must be a whole number"),
-        ({"seed": -1}, "seed must not be negative, got -1"),
+        ({"seed": -1}, "seed must be a whole number and not negative, got -1"),
+        ({"seed": 1.5}, "seed must be a whole number and not negative, got 1.5"),
+        ({"observation": lambda s: {}}, "observation must return at least one field"),
+        ({"observation": lambda s: {"x": [1.0]}}, "observation field 'x' must have shape"),
+        ({"task": Push(distance=0.16)}, "obstacles must leave .* and the objects where they are"),
         ({"costs": {}}, "costs must name at least one cost"),
         ({"costs": {"flat": lambda state: 0.0}}, r"cost 'flat' must have shape \(1,\), got \(\)"),
         ({"costs": {"nan": always("nan")}}, "cost 'nan' must be finite"),
@@ -413,6 +420,8 @@ def test_bad_arguments(arguments, message):
         ({"task": Reach}, "task must be an instance of Task, got <class"),
         ({"obstacles": Cylinder()}, "obstacles must be an instance of Obstacles"),
         ({"scene": None}, "scene must be an instance of Scene, got None"),
+        ({"observation": FullObservation}, "observation must be a callable object, got <class"),
+        ({"observation": lambda s: s.goal}, "what observation returns must be an instance of Map"),
         ({"costs": [Collision()]}, "costs must be an instance of Mapping"),
         ({"costs": {"c": Collision}}, "cost 'c' must be a callable object, got <class"),
     ],
@@ -506,6 +515,26 @@ def test_render(make_env):
     red = (pixels[..., 0] > 120) & (pixels[..., 1] < 60) & (pixels[..., 2] < 60)
     assert red.flatten(1).sum(1).min() > 20, "the obstacle is in the picture"
     assert not torch.equal(pixels[0], pixels[1]), "each world has its own goal"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"eye": (1, 2)}, r"eye must have shape \(3,\), got \(2,\)"),
+        ({"eye": (0, 0, 1), "target": (0, 0, 1)}, "eye must not be where it looks"),
+        ({"field_of_view": 0}, "field_of_view must be positive and finite, got 0"),
+        ({"field_of_view": 180}, "field_of_view must be less than 180, got 180"),
+    ],
+)
+def test_camera_rejects(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Camera(**arguments)
+
+
+def test_render_wants_a_camera(make_env):
+    env = make_env(ArmEnv)
+    with pytest.raises(TypeError, match="camera must be an instance of Camera, got 'above'"):
+        env.render(camera="above")
 
 
 def test_pixels_in_a_rollout(make_env):

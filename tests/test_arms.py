@@ -23,7 +23,8 @@ from torchrl_safe.envs import (
     Reach,
     Scene,
 )
-from torchrl_safe.envs.urdf import prepare_urdf
+from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
 
 ARMS = {"panda": PANDA, "iiwa": IIWA, "xarm6": XARM6, "xarm7": XARM7, "ur5": UR5, "ur10": UR10}
 each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
@@ -255,3 +256,27 @@ def test_closed_fingers_are_always_in_contact(pose):
 def test_bad_mount_is_named(name):
     with pytest.raises(ValueError, match=rf"{name} must have shape \(3,\)"):
         Gripper("gripper.urdf", "tool", **{name: (0, 0)})
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"goals": ((0, 0, 0), (1, 1, 1))}, TypeError, "goals must be an instance of Region"),
+        ({"gripper": "gripper.urdf"}, TypeError, "gripper must be an instance of Gripper"),
+        ({"finger_home": float("nan")}, ValueError, "finger_home must be finite"),
+    ],
+)
+def test_arm_rejects(changes, error, message):
+    with pytest.raises(error, match=message):
+        dataclasses.replace(PANDA, **changes)
+
+
+def test_tool_must_be_moved_by_a_joint():
+    with pytest.raises(ValueError, match="ee_link must be a link that a joint moves, got 'panda_l"):
+        World(dataclasses.replace(PANDA, ee_link="panda_link0", home=()), Scene(), ())
+
+
+def test_urdf_of_the_working_directory(tmp_path, monkeypatch):
+    (tmp_path / "mine.urdf").write_text("<robot name='mine'/>")
+    monkeypatch.chdir(tmp_path)
+    assert find_urdf("mine.urdf") == tmp_path / "mine.urdf"

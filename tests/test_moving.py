@@ -315,3 +315,14 @@ def test_what_moves_must_be_fixed(make_env):
 def test_bad_paths(path, message):
     with pytest.raises(ValueError, match=message):
         ArmEnv(obstacles=Places(Box(), at=[(0.6, 0, 0.1)], path=path))
+
+
+def test_moving_leaves_the_paths_of_its_layout_alone():
+    """Also if they return the same array each time."""
+    kept = {n: (np.zeros((n, 1, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1, 1))) for n in (1, 2)}
+    inner = Places(Sphere(), at=[(0.7, 0, 0.4)], path=lambda times: kept[len(times)])
+    placement = Moving(inner, Swing()).sample(np.random.default_rng(0), START, GOAL)
+    times = np.array([0.1, 0.2])
+    first = placement.at(times)[0]
+    np.testing.assert_array_equal(placement.at(times)[0], first)
+    np.testing.assert_array_equal(kept[2][0], 0)

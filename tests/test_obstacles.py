@@ -247,6 +247,7 @@ def test_bad_placements(arguments, message):
     ("make", "message"),
     [
         (lambda: InFront(gap=0), "gap must be positive and finite, got 0"),
+        (lambda: InFront(gap=0.05), r"gap must leave the goal free, .* radius of 0\.050, got 0.05"),
         (lambda: InFront(gap=float("inf")), "gap must be positive and finite, got inf"),
         (lambda: InFront(height=float("nan")), "height must be finite"),
         (lambda: InFront(direction=(0, 0, 1)), "direction must be horizontal"),

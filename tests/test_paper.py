@@ -14,7 +14,14 @@ from scripted import fly, go, straight
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, Collision, paper_env
+from torchrl_safe.envs import (
+    PAPER_CARTESIAN,
+    PAPER_JOINT,
+    Collision,
+    Proximity,
+    Speed,
+    paper_env,
+)
 
 
 def step(env, action):
@@ -163,3 +170,13 @@ def test_going_around_costs_nothing(make_env):
     success, _, cost = fly(env, around)
     assert success.all()
     assert not cost.any()
+
+
+def test_measuring_changes_nothing(make_env):
+    """Not even where the tool is read one substep late."""
+    costs = {"collision": Collision(margin=0.02), "speed": Speed(), "near": Proximity()}
+    plain, measured = make_env(paper_env, seed=0), make_env(paper_env, seed=0, costs=costs)
+    ahead = lambda td: td.set("action", torch.full((1, 4), 0.3))  # noqa: E731
+    expected, got = (env.rollout(60, ahead)["next"] for env in (plain, measured))
+    assert torch.equal(got["observation"], expected["observation"])
+    assert torch.equal(got["cost"][..., :1], expected["cost"])

@@ -139,7 +139,7 @@ def test_urdf_is_found_by_its_path_or_in_the_packages(tmp_path):
 
 @pytest.mark.parametrize("name", ["", "gone.urdf", "/gone.urdf"])
 def test_missing_urdf_is_named(name):
-    with pytest.raises(ValueError, match=rf"urdf must be .* got '{name}': .*pybullet_data.$"):
+    with pytest.raises(ValueError, match=rf"urdf must be .* got '{name}': .*pybullet_data"):
         find_urdf(name)
 
 

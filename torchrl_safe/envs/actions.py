@@ -106,7 +106,8 @@ class CartesianDelta:
         self, action: Array, state: ArmState, worlds: Sequence[World]
     ) -> tuple[Array, Array]:
         position = state.ee_position + self.step * action[:, :3]
-        kept = np.asarray(self.orientation or worlds[0].home_orientation)
+        home = worlds[0].home_orientation
+        kept = np.asarray(home if self.orientation is None else self.orientation)
         joints = self.inverse_kinematics(
             position, self._orientation(action, state, kept), state, worlds
         )
@@ -122,7 +123,9 @@ class CartesianDelta:
         # How far the tool has turned about the vertical: the twist of its rotation from the
         # kept orientation. Whatever else it has turned by is to be undone.
         twist = multiply(state.ee_orientation, kept * (-1, -1, -1, 1)) * (0, 0, 1, 1)
-        twist /= np.linalg.norm(twist, axis=1, keepdims=True)
+        # Upside down it may have turned by anything: by nothing, then.
+        length = np.linalg.norm(twist, axis=1, keepdims=True)
+        twist = np.where(length < 1e-6, (0, 0, 0, 1), twist / np.maximum(length, 1e-6))
         turn = np.zeros((len(action), 3))
         turn[:, 2] = self.yaw_step * action[:, 3]
         return multiply(multiply(from_rotation_vector(turn), twist), orientation)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial, reduce
+from numbers import Integral
 from operator import or_
 from typing import Any
 
@@ -47,6 +48,11 @@ class ArmEnv(EnvBase):
     (N, 1; the task is done), ``truncated`` (N, 1; the time is up) and ``done`` (N, 1).
     ``cost`` stands in the reward spec, so that
     ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])`` sums both.
+
+    Attributes:
+        observation_fields: the slices of the observation by the names of its fields.
+        arm_state: what tasks and costs have read, the :class:`~torchrl_safe.envs.ArmState` after
+            the last step or reset.
 
     Args:
         arm (ArmModel, optional): the arm. Defaults to ``PANDA``.
@@ -120,9 +126,10 @@ class ArmEnv(EnvBase):
         check_kind("costs", costs, Mapping)
         if not costs:
             raise ValueError("costs must name at least one cost, got an empty mapping.")
-        for name, cost in costs.items():
-            if isinstance(cost, type) or not callable(cost):
-                raise TypeError(f"cost {name!r} must be a callable object, got {cost!r}.")
+        named = [(f"cost {name!r}", cost) for name, cost in costs.items()]
+        for name, function in [*named, ("observation", observation)]:
+            if isinstance(function, type) or not callable(function):
+                raise TypeError(f"{name} must be a callable object, got {function!r}.")
         super().__init__(device=device, batch_size=(num_envs,))
         self.arm = arm
         self.action_mode = action
@@ -212,8 +219,15 @@ class ArmEnv(EnvBase):
         )
         self._outcome(state)
         fields = self._observation(state)
+        check_kind("what observation returns", fields, Mapping)
+        if not fields:
+            raise ValueError("observation must return at least one field, got none.")
         for name, field in fields.items():
-            check_array(f"observation field {name!r}", field, (self.num_envs, *field.shape[1:2]))
+            shape = (self.num_envs, *np.shape(field)[1:2])
+            if len(check_array(f"observation field {name!r}", field, shape).shape) != 2:
+                raise ValueError(
+                    f"observation field {name!r} must have shape (num_envs, width), got {shape}."
+                )
         ends = np.cumsum([field.shape[1] for field in fields.values()])
         self.observation_fields = {
             name: slice(int(end) - field.shape[1], int(end))
@@ -279,8 +293,8 @@ class ArmEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> int | None:
-        if seed is not None and seed < 0:
-            raise ValueError(f"seed must not be negative, got {seed}.")
+        if seed is not None and not (isinstance(seed, Integral) and seed >= 0):
+            raise ValueError(f"seed must be a whole number and not negative, got {seed!r}.")
         self._generators = []
         for _ in range(self.num_envs):
             self._generators.append(np.random.default_rng(seed))
@@ -308,9 +322,11 @@ class ArmEnv(EnvBase):
             RGB pictures, uint8, shape ``(N, height, width, 3)``.
 
         Raises:
+            TypeError: if the camera is not a Camera.
             ValueError: if a size is not a whole number of at least 1.
         """
         check_count(width=width, height=height)
+        check_kind("camera", camera, Camera)
         self._check_open()
         return torch.from_numpy(self._batch.pictures(camera, width, height))
 
@@ -373,8 +389,8 @@ class ArmEnv(EnvBase):
                 break
         else:
             raise ValueError(
-                f"obstacles must leave the arm free at home, got an overlap of {-clearance:.4f} m "
-                f"from {self.obstacles}."
+                f"obstacles must leave the arm free at home and the objects where they are, got an "
+                f"overlap of {-clearance:.4f} m from {self.obstacles}."
             )
         self._elapsed[row] = 0
 

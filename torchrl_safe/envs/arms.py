@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from torchrl_safe.envs.checks import check_array
+from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.regions import Region
 
 
 @dataclass(frozen=True)
 class Gripper:
-    """A gripper that can be mounted on any arm.
+    """A gripper that can be mounted on any arm. Its fingers open alike, as if by a gear.
 
     Args:
         urdf: path of the URDF file, as that of an :class:`ArmModel`.
@@ -46,8 +46,8 @@ class ArmModel:
     (a gripper's fingers) is fixed, unless the :class:`~torchrl_safe.envs.Scene` leaves it free.
 
     Args:
-        urdf: path of the URDF file, absolute or relative to ``pybullet_data`` or to the robots
-            of ``example-robot-data`` (the ``more-arms`` extra).
+        urdf: path of the URDF file, absolute or relative to ``pybullet_data``, to the robots of
+            ``example-robot-data`` (the ``more-arms`` extra) or to the working directory.
         ee_link: name of the end-effector link. Its frame is the tool point, unless a gripper
             is mounted on it.
         home: joint angles at the start of an episode, in radians, one for each joint of the
@@ -58,7 +58,9 @@ class ArmModel:
             are free.
         gripper: what is mounted on ``ee_link``; its ``tool_link`` then is the tool point.
 
-    A file, link or home pose that does not fit raises ValueError where the world is built.
+    Raises:
+        TypeError: if ``goals`` or ``gripper`` is not of its kind. A file, link or home pose that
+            does not fit raises ValueError where the world is built.
 
     Examples:
         >>> iiwa = ArmModel("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", (0, 0.4, 0, -2, 0, 0.74, 0))
@@ -72,6 +74,12 @@ class ArmModel:
     goals: Region = Region((0.6, -0.2, 0.05), (0.7, 0.2, 0.15))
     finger_home: float = 0.0
     gripper: Gripper | None = None
+
+    def __post_init__(self) -> None:
+        check_kind("goals", self.goals, Region)
+        check_array("finger_home", self.finger_home, ())
+        if self.gripper is not None:
+            check_kind("gripper", self.gripper, Gripper)
 
 
 #: A small parallel gripper of our own for any flange: 0.5 kg, opens by 0.04 m to each side.

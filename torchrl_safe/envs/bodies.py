@@ -130,6 +130,8 @@ def _find_joints(client: int, body: int, chain: set[str], tool_link: str) -> Loa
         if info[2] == pybullet.JOINT_FIXED and info[16] in base:
             base.add(info[0])
     joints = [info for info in movable if info[1].decode() in chain]
+    if not joints:
+        raise ValueError(f"ee_link must be a link that a joint moves, got {tool_link!r}.")
     fingers = [info for info in movable if info[1].decode() not in chain]
     unlimited = [info[8] >= info[9] for info in joints]
     return LoadedArm(

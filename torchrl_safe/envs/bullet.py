@@ -99,7 +99,9 @@ class World:
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
         furniture = load_furniture(client, scene, visuals=visuals)
         self._arm = load_arm(client, arm, scene, visuals=visuals, self_collision=sensing.itself)
-        self._sensors = Sensors(client, self._arm, furniture, len(shapes), sensing)
+        self._sensors = Sensors(
+            client, self._arm, furniture, len(shapes), sensing, fresh_links=scene.fresh_links
+        )
         red, blue = (_RED, _BLUE) if visuals else (None, None)
         self._obstacles = [
             add_shape(client, shape, _limbo(index), red) for index, shape in enumerate(shapes)
@@ -223,9 +225,7 @@ class World:
         measurements = []
         ways = None if self._placement.path is None else self._look_ahead(substeps)
         senses = self._sensors.sensing != Sensing()
-        for substep in range(substeps):
-            if ways is not None:
-                self._follow(*ways[substep + 1])
+        for substep in range(1, substeps + 1):
             pybullet.stepSimulation(physicsClientId=client)
             for index in self._present:
                 points = pybullet.getContactPoints(
@@ -235,6 +235,9 @@ class World:
                     nearest, force = min(p[8] for p in points), sum(p[9] for p in points)
                     distances[index] = min(distances[index], nearest)
                     forces[index] = max(forces[index], force)
+            # Bullet has looked for contacts before it moved the arm: now the obstacles move too.
+            if ways is not None:
+                self._follow(*ways[substep])
             if senses:
                 measurements.append(self.measure())
         self._substeps += substeps
@@ -320,12 +323,13 @@ class World:
         return self._sensors.shapes()
 
     def clearance(self) -> float:
-        """Returns the smallest distance between arm and obstacles, up to 0.1 m."""
+        """Returns the smallest distance of obstacles from arm and objects, up to 0.1 m."""
         points = [
             point[8]
             for index in self._present
+            for body in (self._arm.body, *self._objects)
             for point in pybullet.getClosestPoints(
-                self._arm.body, self._obstacles[index], 0.1, physicsClientId=self._client
+                body, self._obstacles[index], 0.1, physicsClientId=self._client
             )
         ]
         return min(points, default=0.1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from numbers import Real
 from types import UnionType
 from typing import Any, get_args
 
@@ -12,9 +13,9 @@ from torchrl_safe.envs.state import Array
 
 
 def check_positive(**values: float) -> None:
-    """Raises ValueError unless each value is positive and finite."""
+    """Raises ValueError unless each value is a number, positive and finite."""
     for name, value in values.items():
-        if not 0 < value < np.inf:
+        if not isinstance(value, Real) or not 0 < value < np.inf:
             raise ValueError(f"{name} must be positive and finite, got {value}.")
 
 
@@ -39,7 +40,10 @@ def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
 
 def check_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     """Returns the values as an array; raises ValueError unless they have a shape and are finite."""
-    array = np.asarray(values, dtype=float)
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers of shape {shape}, got {values!r}.") from error
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}.")
     if not np.isfinite(array).all():

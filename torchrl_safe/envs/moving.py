@@ -116,6 +116,8 @@ class Patrol:
 class Moving:
     """Any layout, in motion. The obstacles follow their way whatever they hit.
 
+    Only their places at the start are checked to leave the arm at home and the objects free.
+
     Args:
         layout: where the obstacles are; must be fixed shapes (mass 0).
         motion: how each of them moves, drawn anew for each obstacle and episode.
@@ -156,10 +158,10 @@ class Moving:
 
         def path(times: Array) -> tuple[Array, Array]:
             positions, orientations = base.at(times)
-            # Positions are a copy: each obstacle adds its own displacement.
+            moved = positions.copy()
             for index, displacement in enumerate(displacements):
-                positions[:, index] += displacement(times)
-            return positions, orientations
+                moved[:, index] += displacement(times)
+            return moved, orientations
 
         position, orientation = path(np.zeros(1))
         return Placement(position[0], orientation[0], base.present, path)

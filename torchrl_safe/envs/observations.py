@@ -12,7 +12,10 @@ from torchrl_safe.envs.state import ArmState, Array
 
 @dataclass(frozen=True)
 class FullObservation:
-    """Everything that makes the task Markov, whatever arm, task and obstacles are.
+    """Where everything is and how it moves, whatever arm, task and obstacles are.
+
+    For obstacles at rest that makes the task Markov. What moves on a path keeps its plans to
+    itself: when a patrol turns round, or what a human will reach for next.
 
     The fields, in order; those of free fingers and objects are empty where there are none:
 

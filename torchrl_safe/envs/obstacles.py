@@ -98,7 +98,8 @@ class Obstacles(Protocol):
     def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
         """Places one world's obstacles for an episode.
 
-        The environment asks again, up to 100 times, for obstacles that touch the arm at home.
+        The environment asks again, up to 100 times, while an obstacle touches the arm at home or
+        an object.
 
         Args:
             rng: the generator of the world.
@@ -138,8 +139,8 @@ class InFront:
         height: height of the obstacle's centre, m. ``None`` stands it on the table.
 
     Raises:
-        ValueError: if ``gap`` is not positive or ``direction`` is not horizontal; when a goal
-            is drawn that leaves no room for the obstacle before it.
+        ValueError: if ``gap`` leaves the goal inside the obstacle or ``direction`` is not
+            horizontal; when a goal is drawn that leaves no room for the obstacle before it.
 
     Examples:
         >>> InFront(gap=0.2).shapes
@@ -154,6 +155,11 @@ class InFront:
     def __post_init__(self) -> None:
         check_positive(gap=self.gap)
         check_kind("shape", self.shape, Shape)
+        if self.gap <= self.shape.footprint:
+            raise ValueError(
+                f"gap must leave the goal free, more than the obstacle's radius of "
+                f"{self.shape.footprint:.3f}, got {self.gap}."
+            )
         if self.direction is not None:
             direction = check_array("direction", self.direction, (3,))
             if direction[2] != 0 or not direction.any():
@@ -226,7 +232,7 @@ class Scattered:
                 f"clearance and spacing must not be negative, got {self.clearance} and "
                 f"{self.spacing}."
             )
-        if self.fewest is not None and (self.fewest % 1 or not 0 <= self.fewest <= self.count):
+        if self.fewest is not None and self.fewest not in range(self.count + 1):
             raise ValueError(
                 f"fewest must be a whole number between 0 and count = {self.count}, got "
                 f"{self.fewest}."

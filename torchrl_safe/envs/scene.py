@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from torchrl_safe.envs.checks import check_array, check_positive
 
 #: Duration of one physics substep, s (PyBullet's default).
@@ -61,6 +63,10 @@ class Camera:
         target: the point it looks at, m.
         field_of_view: vertical, degrees.
 
+    Raises:
+        ValueError: if a point is not three finite numbers, both are the same, or the field of view
+            is not between 0 and 180 degrees.
+
     Examples:
         >>> Camera(eye=(0.4, -1.5, 0.4)).field_of_view
         45.0
@@ -69,3 +75,12 @@ class Camera:
     eye: tuple[float, float, float] = (1.0, -1.25, 0.7)
     target: tuple[float, float, float] = (0.3, 0.0, 0.3)
     field_of_view: float = 45.0
+
+    def __post_init__(self) -> None:
+        if np.array_equal(
+            check_array("eye", self.eye, (3,)), check_array("target", self.target, (3,))
+        ):
+            raise ValueError(f"eye must not be where it looks, got {self.eye} for both.")
+        check_positive(field_of_view=self.field_of_view)
+        if self.field_of_view >= 180:
+            raise ValueError(f"field_of_view must be less than 180, got {self.field_of_view}.")

@@ -36,6 +36,8 @@ class Sensors:
         furniture: numbers of the bodies that count as the table.
         num_obstacles: number of obstacles, present or not.
         sensing: what is measured.
+        fresh_links: read links where they are now. Reading one so makes Bullet forget where it
+            was one substep ago, which a scene may want to be read.
     """
 
     def __init__(
@@ -45,10 +47,13 @@ class Sensors:
         furniture: Sequence[int],
         num_obstacles: int,
         sensing: Sensing,
+        *,
+        fresh_links: bool,
     ) -> None:
         self._client, self._arm, self._furniture = client, arm, furniture
         self._num_obstacles = num_obstacles
         self._num_links = pybullet.getNumJoints(arm.body, physicsClientId=client)
+        self._fresh_links = fresh_links
         self.sensing = sensing
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -91,7 +96,7 @@ class Sensors:
             states = pybullet.getJointStates(arm.body, arm.joints, physicsClientId=client)
             row += [state[0] for state in states]
         if sensing.tool:
-            link = link_state(client, arm.body, arm.ee)
+            link = link_state(client, arm.body, arm.ee, fresh=self._fresh_links)
             row += [*link[4], *velocity_at(link[4], link[0], link[6], link[7])]
         if sensing.links:
             links = pybullet.getLinkStates(
@@ -112,7 +117,7 @@ class Sensors:
         link, on_arm, on_obstacle, normal = point[3], point[5], point[6], point[7]
         arm_velocity: Vector = (0.0, 0.0, 0.0)
         if link >= 0:
-            state = link_state(client, arm, link)
+            state = link_state(client, arm, link, fresh=self._fresh_links)
             arm_velocity = velocity_at(on_arm, state[0], state[6], state[7])
         obstacle_velocity = velocity_at(on_obstacle, *obstacle[1:])
         # The normal points from the obstacle to the arm.
@@ -135,7 +140,7 @@ class Sensors:
         )
 
 
-def link_state(client: int, body: int, link: int, *, fresh: bool = True) -> tuple:
+def link_state(client: int, body: int, link: int, *, fresh: bool) -> tuple:
     """PyBullet's record of a link with its velocity, of now or of one substep ago."""
     return pybullet.getLinkState(
         body,

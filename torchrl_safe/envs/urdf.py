@@ -59,7 +59,8 @@ def find_urdf(name: str) -> Path:
 
     Args:
         name: path, absolute or relative to the folder of ``pybullet_data``, of the robots of
-            example-robot-data where that is installed, or of this package.
+            example-robot-data where that is installed, of this package, or to the working
+            directory.
 
     Raises:
         ValueError: if there is no such file.
@@ -68,8 +69,8 @@ def find_urdf(name: str) -> Path:
         # An absolute name takes the place of the folder.
         if (folder / name).is_file():
             return folder / name
-    hint = "there is no such file, neither as an absolute path nor in pybullet_data"
-    if name.partition("/")[0].endswith("_description"):
+    hint = f"there is no such file in any of {[str(folder) for folder in _folders()]}"
+    if str(name).partition("/")[0].endswith("_description"):
         hint += f'; the arms of {_MORE_ARMS} need `pip install "torchrl-safe[more-arms]"`'
     raise ValueError(f"urdf must be a readable URDF file, got {name!r}: {hint}.")
 
@@ -96,6 +97,7 @@ def _folders() -> Iterator[Path]:
     else:
         yield Path(str(package.locate_file(f"cmeel.prefix/share/{_MORE_ARMS}/robots")))
     yield Path(__file__).parent
+    yield Path.cwd()
 
 
 def _read(name: str, *, visuals: bool) -> ElementTree.Element:
