@@ -34,12 +34,6 @@ from tqdm import tqdm
 from experiments.evaluation import evaluate, summarize
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.envs import (
-    IIWA,
-    PANDA,
-    UR5,
-    UR10,
-    XARM6,
-    XARM7,
     ActionMode,
     ArmEnv,
     CartesianDelta,
@@ -51,10 +45,11 @@ from torchrl_safe.envs import (
     NoObstacles,
     Obstacles,
     Scattered,
+    gym,
 )
 from torchrl_safe.objectives import DualAscent, MultiplierUpdater, PIDControl, PPOLagrangianLoss
 
-ARMS = {"panda": PANDA, "iiwa": IIWA, "xarm6": XARM6, "xarm7": XARM7, "ur5": UR5, "ur10": UR10}
+ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 OBSTACLES: dict[str, Obstacles] = {
     "none": NoObstacles(),
     "in-front": InFront(),

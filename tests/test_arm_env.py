@@ -13,9 +13,9 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.record import PixelRenderTransform
+from worlds import each_arm
 
 from torchrl_safe.envs import (
-    PANDA,
     ArmEnv,
     Camera,
     CartesianDelta,
@@ -32,7 +32,6 @@ from torchrl_safe.envs import (
     Scene,
 )
 
-ARMS = {"panda": PANDA}
 ACTIONS = [CartesianDelta(), JointDelta()]
 TWO = (Cylinder(), Cylinder())
 ROLLING = InFront(shape=Cylinder(mass=1.0))
@@ -64,7 +63,7 @@ class Places:
         return Placement(self.places)
 
 
-@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
+@each_arm
 @pytest.mark.parametrize("num_envs", [1, 3])
 @pytest.mark.parametrize("action", ACTIONS, **by_name)
 @pytest.mark.parametrize(

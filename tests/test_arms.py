@@ -8,14 +8,12 @@ import pybullet
 import pytest
 import torch
 from tensordict import TensorDict
+from worlds import ARMS, each_arm
 
 from torchrl_safe.envs import (
     IIWA,
     PANDA,
     UR5,
-    UR10,
-    XARM6,
-    XARM7,
     ArmEnv,
     CartesianDelta,
     Gripper,
@@ -25,9 +23,6 @@ from torchrl_safe.envs import (
 )
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
-
-ARMS = {"panda": PANDA, "iiwa": IIWA, "xarm6": XARM6, "xarm7": XARM7, "ur5": UR5, "ur10": UR10}
-each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
 
 
 class Pose:

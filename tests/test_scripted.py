@@ -19,7 +19,7 @@ from scripted import (
     push_straight,
     straight,
 )
-from test_arms import ARMS
+from worlds import each_arm
 
 from torchrl_safe.envs import (
     PANDA,
@@ -38,7 +38,6 @@ PILOTS = {
     "push": (push_around, push_straight),
     "pick": (carry, carry_low),
 }
-each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
 each_task = pytest.mark.parametrize("task", PILOTS)
 
 

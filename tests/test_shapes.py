@@ -17,6 +17,7 @@ from torchrl_safe.envs import (
 )
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.scene import Scene
+from torchrl_safe.envs.shapes import footprint
 
 SHAPES = {
     "cylinder": Cylinder(radius=0.03, height=0.16, mass=0.3),
@@ -30,12 +31,12 @@ each_shape = pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES.keys()
 def test_extents():
     """Half of the size along each axis, and the circle around it from above."""
     assert Cylinder(0.1, 0.4).half_extents == (0.1, 0.1, 0.2)
-    assert Cylinder(0.1, 0.4).footprint == 0.1
-    assert Box((0.3, 0.4, 0.1)).footprint == pytest.approx(0.5)
+    assert footprint(Cylinder(0.1, 0.4)) == 0.1
+    assert footprint(Box((0.3, 0.4, 0.1))) == pytest.approx(0.5)
     assert Sphere(0.2).half_extents == (0.2, 0.2, 0.2)
-    assert Sphere(0.2).footprint == 0.2
+    assert footprint(Sphere(0.2)) == 0.2
     assert Capsule(0.1, 0.3).half_extents == (0.1, 0.1, 0.25)
-    assert Capsule(0.1, 0.3).footprint == 0.1
+    assert footprint(Capsule(0.1, 0.3)) == 0.1
 
 
 @each_shape

@@ -10,21 +10,16 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_safe.envs import (
-    IIWA,
-    PANDA,
-    UR5,
-    UR10,
-    XARM6,
-    XARM7,
     ArmModel,
     JointDelta,
     NoObstacles,
     Placement,
     Reach,
     Region,
+    gym,
 )
 
-ARMS = {"panda": PANDA, "iiwa": IIWA, "xarm6": XARM6, "xarm7": XARM7, "ur5": UR5, "ur10": UR10}
+ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
 
 _TURNTABLE = """

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torchrl_safe.envs.checks import check_array, check_count, check_kind, check_positive
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.rotations import from_rotation_vector
-from torchrl_safe.envs.shapes import Cylinder, Shape
+from torchrl_safe.envs.shapes import Cylinder, Shape, footprint
 from torchrl_safe.envs.state import Array
 
 #: Positions ``(s, m, 3)``, m, and orientations ``(s, m, 4)`` at s times after the start, s.
@@ -155,10 +155,10 @@ class InFront:
     def __post_init__(self) -> None:
         check_positive(gap=self.gap)
         check_kind("shape", self.shape, Shape)
-        if self.gap <= self.shape.footprint:
+        if self.gap <= footprint(self.shape):
             raise ValueError(
                 f"gap must leave the goal free, more than the obstacle's radius of "
-                f"{self.shape.footprint:.3f}, got {self.gap}."
+                f"{footprint(self.shape):.3f}, got {self.gap}."
             )
         if self.direction is not None:
             direction = check_array("direction", self.direction, (3,))
@@ -255,7 +255,7 @@ class Scattered:
         return Placement(position, from_rotation_vector(yaw), np.arange(self.count) < count)
 
     def _draw(self, rng: np.random.Generator, start: Array, goal: Array, others: Array) -> Array:
-        radius = self.shape.footprint
+        radius = footprint(self.shape)
         ends = np.array([start, goal])[:, :2]
         for _ in range(_ATTEMPTS):
             place = self.region.sample(rng)

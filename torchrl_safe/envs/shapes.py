@@ -44,11 +44,6 @@ class Cylinder:
         """Half of the size along the shape's own x, y and z axes, m."""
         return (self.radius, self.radius, self.height / 2)
 
-    @property
-    def footprint(self) -> float:
-        """Radius of the circle around the upright shape seen from above, m."""
-        return self.radius
-
 
 @dataclass(frozen=True)
 class Box:
@@ -73,11 +68,6 @@ class Box:
         if not (check_array("half_extents", self.half_extents, (3,)) > 0).all():
             raise ValueError(f"half_extents must be positive, got {self.half_extents}.")
         _check_mass(self.mass)
-
-    @property
-    def footprint(self) -> float:
-        """Radius of the circle around the upright shape seen from above, m."""
-        return float(np.hypot(*self.half_extents[:2]))
 
 
 @dataclass(frozen=True)
@@ -107,11 +97,6 @@ class Sphere:
     def half_extents(self) -> tuple[float, float, float]:
         """Half of the size along the shape's own x, y and z axes, m."""
         return (self.radius,) * 3
-
-    @property
-    def footprint(self) -> float:
-        """Radius of the circle around the upright shape seen from above, m."""
-        return self.radius
 
 
 @dataclass(frozen=True)
@@ -144,11 +129,20 @@ class Capsule:
         """Half of the size along the shape's own x, y and z axes, m."""
         return (self.radius, self.radius, self.length / 2 + self.radius)
 
-    @property
-    def footprint(self) -> float:
-        """Radius of the circle around the upright shape seen from above, m."""
-        return self.radius
-
 
 #: What an obstacle or an object can look like.
 Shape = Cylinder | Box | Sphere | Capsule
+
+
+def footprint(shape: Shape) -> float:
+    """Returns the radius of the circle around an upright shape seen from above, m.
+
+    Examples:
+        >>> footprint(Box((0.03, 0.04, 0.1)))
+        0.05
+    """
+    match shape:
+        case Box():
+            return float(np.hypot(*shape.half_extents[:2]))
+        case Cylinder() | Sphere() | Capsule():
+            return shape.radius
