@@ -159,7 +159,7 @@ def run(config: Config, cell: str, seed: int) -> dict[str, Any]:
             }
         )
     collector.shutdown()
-    test = make_env(action, 20, seed)
+    test = make_env(action, min(20, config.eval_episodes), seed)
     episodes = evaluate(test, actor, config.eval_episodes, seed=seed + 1_000_000)
     test.close()
     return {
