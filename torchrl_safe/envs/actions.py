@@ -11,7 +11,7 @@ import numpy as np
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.checks import check_array, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
-from torchrl_safe.envs.rotations import from_rotation_vector, multiply
+from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
 from torchrl_safe.envs.state import ArmState, Array
 
 
@@ -125,7 +125,7 @@ class CartesianDelta:
         twist = multiply(state.ee_orientation, kept * (-1, -1, -1, 1)) * (0, 0, 1, 1)
         # Upside down it may have turned by anything: by nothing, then.
         length = np.linalg.norm(twist, axis=1, keepdims=True)
-        twist = np.where(length < 1e-6, (0, 0, 0, 1), twist / np.maximum(length, 1e-6))
+        twist = np.where(length < 1e-6, UPRIGHT, twist / np.maximum(length, 1e-6))
         turn = np.zeros((len(action), 3))
         turn[:, 2] = self.yaw_step * action[:, 3]
         return multiply(multiply(from_rotation_vector(turn), twist), orientation)

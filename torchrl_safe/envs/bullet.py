@@ -20,7 +20,7 @@ from torchrl_safe.envs.bodies import (
     load_furniture,
 )
 from torchrl_safe.envs.obstacles import Placement
-from torchrl_safe.envs.rotations import rotation_vector
+from torchrl_safe.envs.rotations import UPRIGHT, rotation_vector
 from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.sensors import MovingBody, Sensors, Vector, link_state, velocity_at
 from torchrl_safe.envs.shapes import Shape
@@ -28,7 +28,6 @@ from torchrl_safe.envs.state import Array, Sensing
 
 _RED, _YELLOW, _BLUE = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.15, 0.4, 0.8, 1.0)
 _LIMBO = (0.0, 0.0, -100.0)
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _AT_REST = (0.0, 0.0, 0.0)
 
 
@@ -133,7 +132,7 @@ class World:
         self._goal: Vector = _LIMBO
         self._present: list[int] = []
         self._poses: list[tuple[Vector, Vector]] = [
-            (_limbo(index), _UPRIGHT) for index in range(len(shapes))
+            (_limbo(index), UPRIGHT) for index in range(len(shapes))
         ]
         self._velocities: list[tuple[Vector, Vector]] = [(_AT_REST, _AT_REST)] * len(shapes)
         link = self._link_state(fresh=True)
@@ -169,7 +168,7 @@ class World:
         self._placement, self._substeps = placement, 0
         poses = zip(placement.position.tolist(), placement.orientation.tolist(), strict=True)
         for index, (body, pose) in enumerate(zip(self._obstacles, poses, strict=True)):
-            self._poses[index] = pose if index in self._present else (_limbo(index), _UPRIGHT)
+            self._poses[index] = pose if index in self._present else (_limbo(index), UPRIGHT)
             self._velocities[index] = (_AT_REST, _AT_REST)
             self._place(body, *self._poses[index])
         if placement.path is not None:
@@ -408,7 +407,7 @@ class World:
             physicsClientId=self._client,
         )
 
-    def _place(self, body: int, position: Vector, orientation: Vector = _UPRIGHT) -> None:
+    def _place(self, body: int, position: Vector, orientation: Vector = UPRIGHT) -> None:
         pybullet.resetBasePositionAndOrientation(
             body, position, orientation, physicsClientId=self._client
         )

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.checks import check_array, check_count, check_kind, check_positive
 from torchrl_safe.envs.regions import Region
-from torchrl_safe.envs.rotations import from_rotation_vector
+from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector
 from torchrl_safe.envs.shapes import Cylinder, Shape, footprint
 from torchrl_safe.envs.state import Array
 
 #: Positions ``(s, m, 3)``, m, and orientations ``(s, m, 4)`` at s times after the start, s.
 Path = Callable[[Array], tuple[Array, Array]]
 
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _ATTEMPTS = 1000
 
 
@@ -50,7 +49,7 @@ class Placement:
 
     def __post_init__(self) -> None:
         count = len(self.position)
-        upright = np.tile(_UPRIGHT, (count, 1))
+        upright = np.tile(UPRIGHT, (count, 1))
         present = np.ones(count, bool) if self.present is None else np.asarray(self.present, bool)
         if present.shape != (count,):
             raise ValueError(f"present must have shape {(count,)}, got {present.shape}.")

@@ -6,6 +6,9 @@ import numpy as np
 
 from torchrl_safe.envs.state import Array
 
+#: The orientation of what is not turned.
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
 
 def rotation_vector(current: Array, wanted: Array) -> Array:
     """Returns the rotation from current orientations to wanted ones, in world coordinates.
