@@ -27,9 +27,20 @@ class MultiplierUpdater(abc.ABC):
         cost_limit (float or Tensor): limit of each expected episode cost, one number or k, in
             the unit of the undiscounted episode cost.
         max_multiplier (float, optional): upper bound of every multiplier. Defaults to no bound.
+        pessimism (float, optional): standard errors of the batch's mean episode cost that are
+            added to it. A limit that binds is otherwise met on average only: policies end above
+            it as often as below. Few or uneven episodes are trusted less; a batch of one
+            episode has no standard error, and adds none. Defaults to ``0.0``.
+        normalize (bool, optional): measure the violation by what the costs are like: divided by
+            the larger of mean and limit, and by the larger of the episodes' standard deviation
+            and the limit. Costs in another unit, multiplied by ten say, then give a tenth of
+            the multiplier and change nothing else, so that one step size suits limits of 0.5 and
+            of 50, and an early policy that violates the limit a hundred times over does not
+            throw the multiplier out of reach. For costs that are never negative. Defaults to
+            ``False``.
 
     Raises:
-        ValueError: if the loss has no such buffer, or a limit or bound is not usable.
+        ValueError: if the loss has no such buffer, or a limit, bound or pessimism is not usable.
 
     Examples:
         >>> import torch
@@ -49,6 +60,8 @@ class MultiplierUpdater(abc.ABC):
         *,
         cost_limit: float | Tensor,
         max_multiplier: float | None = None,
+        pessimism: float = 0.0,
+        normalize: bool = False,
     ) -> None:
         if not isinstance(loss_module, LossModule):
             raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
@@ -65,9 +78,15 @@ class MultiplierUpdater(abc.ABC):
             raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
         if max_multiplier is not None and not max_multiplier > 0:
             raise ValueError(f"max_multiplier must be positive, got {max_multiplier}.")
+        if not 0 <= pessimism < float("inf"):
+            raise ValueError(f"pessimism must be finite and not negative, got {pessimism}.")
+        if normalize and (limit < 0).any():
+            raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
         self.loss_module = loss_module
         self.cost_limit = limit.expand_as(multiplier).clone()
         self.max_multiplier = max_multiplier
+        self.pessimism = pessimism
+        self.normalize = normalize
 
     @torch.no_grad()
     def step(self, episode_cost: Tensor) -> None:
@@ -94,13 +113,27 @@ class MultiplierUpdater(abc.ABC):
             raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
         if not len(episode_cost):
             return
-        mean_cost = episode_cost.to(multiplier).mean(0)
-        proposal = self.next_multiplier(multiplier, mean_cost - self.cost_limit.to(multiplier))
+        violation = self._violation(episode_cost.to(multiplier))
+        proposal = self.next_multiplier(multiplier, violation)
         if proposal.shape != multiplier.shape or not proposal.isfinite().all():
             raise ValueError(
                 f"next_multiplier must return {len(multiplier)} finite numbers, got {proposal}."
             )
         multiplier.copy_(proposal.clamp(0, self.max_multiplier))
+
+    def _violation(self, episode_cost: Tensor) -> Tensor:
+        mean, limit = episode_cost.mean(0), self.cost_limit.to(episode_cost)
+        # One episode says nothing of the spread; its cost is a spread of the right size.
+        single = len(episode_cost) == 1
+        spread = mean if single else episode_cost.std(0)
+        error = torch.zeros_like(mean) if single else spread / len(episode_cost) ** 0.5
+        cost = mean + self.pessimism * error
+        if not self.normalize:
+            return cost - limit
+        spread = torch.maximum(spread, limit)
+        # Without any spread and with a limit of 0, the cost itself is all there is to measure by.
+        scale = torch.maximum(cost, limit) * torch.where(spread > 0, spread, cost)
+        return torch.where(scale > 0, (cost - limit) / scale, 0.0)
 
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
@@ -108,7 +141,8 @@ class MultiplierUpdater(abc.ABC):
 
         Args:
             multiplier (Tensor): current multipliers, shape ``(k,)``. Not to be changed.
-            violation (Tensor): mean episode cost minus limit, shape ``(k,)``.
+            violation (Tensor): mean episode cost minus limit, shape ``(k,)``, with ``pessimism``
+                and ``normalize`` as they were chosen.
 
         Returns:
             The proposed multipliers, shape ``(k,)``.
@@ -116,7 +150,12 @@ class MultiplierUpdater(abc.ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the rule; the multipliers are in the state of the loss."""
-        return {"cost_limit": self.cost_limit.clone(), "max_multiplier": self.max_multiplier}
+        return {
+            "cost_limit": self.cost_limit.clone(),
+            "max_multiplier": self.max_multiplier,
+            "pessimism": self.pessimism,
+            "normalize": self.normalize,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads a state that :meth:`state_dict` returned.
@@ -131,6 +170,8 @@ class MultiplierUpdater(abc.ABC):
             )
         self.cost_limit = state_dict["cost_limit"].clone()
         self.max_multiplier = state_dict["max_multiplier"]
+        self.pessimism = state_dict["pessimism"]
+        self.normalize = state_dict["normalize"]
 
 
 class DualAscent(MultiplierUpdater):
@@ -150,6 +191,9 @@ class DualAscent(MultiplierUpdater):
         cost_limit (float or Tensor): see :class:`MultiplierUpdater`.
         lr (float): step size, in multiplier per unit of violated cost.
         max_multiplier (float, optional): see :class:`MultiplierUpdater`.
+        pessimism (float, optional): see :class:`MultiplierUpdater`.
+        normalize (bool, optional): see :class:`MultiplierUpdater`. ``lr`` is then in multiplier
+            times standard deviation of the episode cost.
         optimizer (callable, optional): called as ``optimizer([parameter], lr=lr)``.
             Defaults to :class:`torch.optim.SGD`.
         parametrization (Transform, optional): the multiplier as a function of the parameter
@@ -180,10 +224,18 @@ class DualAscent(MultiplierUpdater):
         cost_limit: float | Tensor,
         lr: float,
         max_multiplier: float | None = None,
+        pessimism: float = 0.0,
+        normalize: bool = False,
         optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.SGD,
         parametrization: Transform = identity_transform,
     ) -> None:
-        super().__init__(loss_module, cost_limit=cost_limit, max_multiplier=max_multiplier)
+        super().__init__(
+            loss_module,
+            cost_limit=cost_limit,
+            max_multiplier=max_multiplier,
+            pessimism=pessimism,
+            normalize=normalize,
+        )
         if not 0 < lr < float("inf"):
             raise ValueError(f"lr must be positive and finite, got {lr}.")
         multiplier = loss_module.lagrange_multiplier
