@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow paper gallery lint format type clean
+.PHONY: train test test-slow paper sweep profile gallery lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -19,6 +19,12 @@ test-slow: $(READY)  ## the tests that train for minutes
 
 paper: $(READY)  ## Table 1 and Figure 2 of the paper, run again; goes on where it was stopped
 	$(BIN)/python -m experiments.paper $(ARGS)
+
+sweep: $(READY)  ## is the limit kept, whatever it is? goes on where it was stopped
+	$(BIN)/python -m experiments.sweep $(ARGS)
+
+profile: $(READY)  ## return and cost for fixed multipliers; goes on where it was stopped
+	$(BIN)/python -m experiments.multiplier_profile $(ARGS)
 
 gallery: $(READY)  ## the contact sheet of docs/environments.md
 	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)

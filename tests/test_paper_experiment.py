@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.paper import CELLS, Config, main, make_agent, make_env, missing, per_epoch, table
+from experiments.grid import missing
+from experiments.paper import CELLS, Config, jobs, main, make_agent, make_env, per_epoch, table
 
 SMALL = {"seeds": 1, "epochs": 2, "workers": 2, "eval_episodes": 1}
 
@@ -34,11 +35,11 @@ def test_what_it_leaves(finished):
 def test_only_what_is_missing_is_run(finished):
     path = finished.out / "AR1-PPO-0.json"
     stamps = {other: other.stat().st_mtime_ns for other in finished.out.glob("AR*.json")}
-    assert not list(missing(finished))
+    assert not missing(jobs(finished))
     first = json.loads(path.read_text())
     path.unlink()
-    assert [file for file, *_ in missing(finished)] == [path]
-    assert len(list(missing(dataclasses.replace(finished, seeds=2)))) == 5
+    assert missing(jobs(finished)) == [path]
+    assert len(missing(jobs(dataclasses.replace(finished, seeds=2)))) == 5
     main(finished)
     assert {other for other in stamps if other.stat().st_mtime_ns != stamps[other]} == {path}
     # Run again, it comes out the same.

@@ -10,8 +10,9 @@ import torch
 from PIL import Image
 from torchrl.checkpoint import Checkpoint
 
+from experiments.agent import make_agent
 from experiments.report import table
-from experiments.train import MULTIPLIER_RULES, Config, make_agent
+from experiments.train import MULTIPLIER_RULES, Config, make_env
 
 ROOT = Path(__file__).parent.parent
 
@@ -25,6 +26,14 @@ def run(*arguments):
         timeout=280,
         check=False,
     )
+
+
+def make_loss():
+    torch.manual_seed(0)
+    env = make_env(Config(), num_envs=1, seed=0)
+    _, loss = make_agent(env, gamma=0.97)
+    env.close()
+    return loss
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +78,7 @@ def test_ppo_has_no_multiplier_and_its_brother_has(finished):
 def test_checkpoint_holds_the_loss(finished):
     out, _ = finished
     results = json.loads((out / "results.json").read_text())
-    _, loss = make_agent(Config())
+    loss = make_loss()
     before = {key: value.clone() for key, value in loss.state_dict().items()}
     Checkpoint(loss=loss).load(out / "ppo-lagrangian" / "checkpoint")
     last = results["algorithms"]["ppo-lagrangian"]["history"][-1]
@@ -103,10 +112,30 @@ def test_multiplier_rules():
     """An episode 2 above the limit: 0.1 times 2, with proportional control 5 times as much more."""
     multiplier = {}
     for name, rule in MULTIPLIER_RULES.items():
-        _, loss = make_agent(Config())
-        rule(loss, 1.0, 0.1).step(torch.tensor([[3.0]]))
+        loss = make_loss()
+        rule(loss, 0.1, cost_limit=1.0).step(torch.tensor([[3.0]]))
         multiplier[name] = loss.lagrange_multiplier.item()
     assert multiplier == pytest.approx({"dual-ascent": 0.2, "pid": 1.2})
+
+
+def test_agent_knows_the_scale_of_what_it_sees_and_predicts():
+    config = Config(paper=True, observation="paper")
+    torch.manual_seed(0)
+    env = make_env(config, num_envs=4, seed=0)
+    actor, loss = make_agent(env, gamma=0.99, multiplier_init=2.0)
+    with torch.no_grad():
+        seen = env.rollout(100, break_when_any_done=False)
+        standardized = actor.get_submodule("0.module.0.0")(seen["observation"])
+        value = loss.critic_network(seen.clone())["state_value"]
+    env.close()
+    # Of other episodes than the ones it was fitted to: the target differs, the rest does not.
+    assert standardized.mean().abs() < 0.5
+    assert 0.2 < standardized[..., :3].std() < 3
+    # A step costs about -0.6 of reward; the untrained prediction is small in that unit.
+    assert 0 < value.abs().mean() < 5
+    assert loss.lagrange_multiplier.item() == 2.0
+    # The paper's actions are not bounded, so the policy is a plain Gaussian.
+    assert type(actor.get_dist(seen)).__name__ == "IndependentNormal"
 
 
 @pytest.mark.parametrize(
@@ -116,7 +145,9 @@ def test_multiplier_rules():
         ({"workers": 0}, "workers must be at least 1, got 0"),
         ({"envs": 5, "workers": 2}, "envs must be a multiple of workers, got 5 and 2"),
         ({"envs": 6, "workers": 2}, "frames_per_batch must be a multiple of envs"),
-        ({"margin": 1.0}, "margin must be at least 0 and less than 1, got 1.0"),
+        ({"pessimism": -1.0}, "pessimism must not be negative, got -1.0"),
+        ({"multiplier_init": -1.0}, "multiplier_init must not be negative, got -1.0"),
+        ({"gamma": 1.0}, "gamma must be between 0 and 1, got 1.0"),
         ({"minibatch": 0}, "minibatch must be at least 1, got 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be positive, got nan"),
         ({"cost_limit": -1.0}, "cost_limit must not be negative, got -1.0"),

@@ -1,0 +1,47 @@
+"""Runs many independent jobs side by side, each once: a stopped grid goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+
+def missing(jobs: Mapping[Path, Any]) -> list[Path]:
+    """The files of jobs that have not been run."""
+    return [path for path in jobs if not path.exists()]
+
+
+def run_grid(
+    run: Callable[..., dict[str, Any]],
+    jobs: Mapping[Path, tuple[Any, ...]],
+    *,
+    workers: int,
+    name: str,
+) -> list[dict[str, Any]]:
+    """Runs what is missing and returns what all jobs returned, in their order.
+
+    Args:
+        run: called as ``run(*arguments)`` in a process of its own; what it returns is kept as
+            JSON.
+        jobs: the arguments of each job by the file its result is kept in.
+        workers: processes side by side.
+        name: what the progress bar is called.
+    """
+    for path in jobs:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    todo = missing(jobs)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context) as pool:
+        paths = {pool.submit(run, *jobs[path]): path for path in todo}
+        for done in tqdm(as_completed(paths), total=len(todo), desc=name, unit="run"):
+            # A stopped program leaves no half of a file behind.
+            unfinished = paths[done].with_suffix(".unfinished")
+            unfinished.write_text(json.dumps(done.result()))
+            unfinished.rename(paths[done])
+    return [json.loads(path.read_text()) for path in jobs]

@@ -1,0 +1,143 @@
+"""What a multiplier buys: ``make profile``, return and cost for fixed multipliers.
+
+The Pareto front of return and cost that fixed multipliers trace (as arXiv 2510.17564 recommends to
+show), and where the multiplier rules end for some limits: on the front, if they are any good.
+Stopped and started again, it goes on with the runs that are missing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+
+from experiments import train
+from experiments.grid import run_grid
+from experiments.report import COLOURS
+
+RULES: tuple[train.MultiplierRule, ...] = ("dual-ascent", "pid")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train with fixed multipliers, and with rules that move them."""
+
+    multipliers: tuple[float, ...] = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)
+    """Fixed multipliers."""
+    limits: tuple[float, ...] = (2.0, 0.5)
+    """Cost limits that each multiplier rule is given."""
+    action: train.Action = "cartesian"
+    """What an action moves."""
+    seeds: int = 3
+    """Runs of each, with seeds from 0."""
+    frames: int = train.Config.frames
+    """Control steps to train for."""
+    eval_episodes: int = 256
+    """Episodes of the final evaluation of each run, with the deterministic policy."""
+    workers: int = os.cpu_count() or 1
+    """Runs side by side."""
+    out: Path = Path("runs/profile")
+    """Folder of results; runs that are already there are not run again."""
+
+
+def run(config: Config, rule: train.MultiplierRule, value: float, seed: int) -> dict[str, Any]:
+    """Trains and evaluates one policy; ``value`` is the multiplier, or the rule's cost limit."""
+    fixed = rule == "fixed"
+    settings = train.Config(
+        action=config.action,
+        multiplier_rule=rule,
+        multiplier_init=value if fixed else 0.0,
+        cost_limit=0.0 if fixed else value,
+        seed=seed,
+        frames=config.frames,
+        eval_episodes=config.eval_episodes,
+        workers=1,
+        out=config.out / "runs" / f"{rule}-{value:g}-{seed}",
+    )
+    _, result = train.train_and_evaluate(settings, "ppo-lagrangian", progress=False)
+    return {"rule": rule, "value": value, "seed": seed, **result}
+
+
+def jobs(config: Config) -> dict[Path, tuple[Config, train.MultiplierRule, float, int]]:
+    """What to run, by the file of its results."""
+    settings: list[tuple[train.MultiplierRule, float]] = [
+        ("fixed", value) for value in config.multipliers
+    ]
+    settings += product(RULES, config.limits)
+    return {
+        config.out / f"{rule}-{value:g}-{seed}.json": (config, rule, value, seed)
+        for seed, (rule, value) in product(range(config.seeds), settings)
+    }
+
+
+def points(runs: list[dict[str, Any]]) -> dict[tuple[str, float], np.ndarray]:
+    """Return, cost, success and last multiplier of each seed, by rule and value."""
+    found: dict[tuple[str, float], list[list[float]]] = {}
+    for run in runs:
+        figures = [run["evaluation"][name][0] for name in ("return", "cost/collision", "success")]
+        figures.append(run["history"][-1]["multiplier/collision"])
+        found.setdefault((run["rule"], run["value"]), []).append(figures)
+    return {key: np.array(rows) for key, rows in found.items()}
+
+
+def table(runs: list[dict[str, Any]]) -> str:
+    """Returns a Markdown table: mean and standard deviation over seeds."""
+    lines = ["| | return | cost | success | multiplier at the end |", "|---" * 5 + "|"]
+    for (rule, value), rows in points(runs).items():
+        name = f"fixed at {value:g}" if rule == "fixed" else f"{rule}, limit {value:g}"
+        cells = (f"{m:.2f} ± {s:.2f}" for m, s in zip(rows.mean(0), rows.std(0), strict=True))
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def plot(runs: list[dict[str, Any]], path: Path) -> None:
+    """Draws return against cost: each seed, the means of fixed multipliers joined."""
+    figure, axis = plt.subplots(figsize=(6.4, 4.4))
+    found = points(runs)
+    fixed = {value: rows for (rule, value), rows in found.items() if rule == "fixed"}
+    middle = np.array([rows.mean(0) for rows in fixed.values()])
+    axis.plot(middle[:, 1], middle[:, 0], "o-", color="grey", label="fixed multiplier")
+    for value, (reward, cost, *_) in zip(fixed, middle, strict=True):
+        axis.annotate(f"{value:g}", (cost, reward), xytext=(5, -12), textcoords="offset points")
+        axis.plot(fixed[value][:, 1], fixed[value][:, 0], ".", color="grey", alpha=0.5)
+    limits = sorted({value for rule, value in found if rule != "fixed"})
+    for rule, colour in zip(RULES, COLOURS[1:], strict=False):
+        for limit, marker in zip(limits, "sD^v", strict=False):
+            rows = found[rule, limit]
+            label = f"{rule}, limit {limit:g}"
+            axis.plot(rows[:, 1], rows[:, 0], marker, color=colour, ls="", label=label, alpha=0.7)
+    for limit in limits:
+        axis.axvline(limit, color="black", ls="--", lw=0.8)
+    axis.set(xlabel="evaluated episode cost", ylabel="evaluated return", xscale="symlog")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main(config: Config) -> None:
+    """Runs what is missing, then writes table, figure and results.json."""
+    runs = run_grid(run, jobs(config), workers=config.workers, name="profile")
+    results = {
+        "config": dataclasses.asdict(config),
+        "defaults": dataclasses.asdict(train.Config()),
+        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
+        "runs": runs,
+    }
+    (config.out / "results.json").write_text(json.dumps(results, default=str))
+    (config.out / "table.md").write_text(table(runs))
+    plot(runs, config.out / "profile.png")
+    print(f"\n{table(runs)}\nResults are in {config.out}.")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,174 @@
+"""Is the limit kept, whatever it is? ``make sweep``: final cost against cost limit.
+
+Trains PPO-Lagrangian as ``make train`` does, with its defaults, for each limit, action and seed,
+and PPO for comparison. Stopped and started again, it goes on with the runs that are missing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import torch
+import tyro
+
+from experiments import train
+from experiments.grid import run_grid
+from experiments.report import COLOURS
+from torchrl_safe.metrics import mean, worst_seed
+
+# Where a cost of 0 is drawn on a logarithmic axis.
+_LEAST = 1e-2
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train for several cost limits and see whether they are kept."""
+
+    paper: bool = False
+    """Train in the paper's environment instead of the benchmark."""
+    limits: tuple[float, ...] = (10.0, 5.0, 2.0, 1.0, 0.5)
+    """Limits of the expected cost of an episode."""
+    actions: tuple[train.Action, ...] = ("cartesian", "joint")
+    """What an action moves."""
+    observation: train.Observation = "full"
+    """What the policy sees."""
+    seeds: int = 5
+    """Runs for each limit, with seeds from 0."""
+    frames: int = train.Config.frames
+    """Control steps to train for."""
+    eval_episodes: int = 256
+    """Episodes of the final evaluation of each run, with the deterministic policy."""
+    workers: int = os.cpu_count() or 1
+    """Runs side by side."""
+    out: Path = Path("runs/sweep")
+    """Folder of results; runs that are already there are not run again."""
+
+
+def run(config: Config, action: train.Action, limit: float | None, seed: int) -> dict[str, Any]:
+    """Trains and evaluates one policy; without a limit, with PPO."""
+    algorithm = "ppo" if limit is None else "ppo-lagrangian"
+    settings = train.Config(
+        paper=config.paper,
+        action=action,
+        observation=config.observation,
+        cost_limit=limit or 0.0,
+        seed=seed,
+        frames=config.frames,
+        eval_episodes=config.eval_episodes,
+        workers=1,
+        out=config.out / "runs" / _name(action, limit, seed),
+    )
+    _, result = train.train_and_evaluate(settings, algorithm, progress=False)
+    return {"action": action, "limit": limit, "seed": seed, **result}
+
+
+def jobs(config: Config) -> dict[Path, tuple[Config, train.Action, float | None, int]]:
+    """What to run, by the file of its results."""
+    limits = (*config.limits, None)
+    return {
+        config.out / f"{_name(action, limit, seed)}.json": (config, action, limit, seed)
+        for seed, action, limit in product(range(config.seeds), config.actions, limits)
+    }
+
+
+def episode_costs(runs: list[dict[str, Any]]) -> torch.Tensor:
+    """Costs of the evaluated episodes, shape (seeds, episodes)."""
+    return torch.tensor([run["episodes"]["episode_cost"] for run in runs]).squeeze(-1)
+
+
+def successes(runs: list[dict[str, Any]]) -> list[float]:
+    """Share of the evaluated episodes that reach the target, for each seed."""
+    return [run["evaluation"]["success"][0] for run in runs]
+
+
+def table(runs: list[dict[str, Any]], config: Config) -> str:
+    """Returns a Markdown table with a row for each action and limit."""
+    lines = [
+        "| action | limit | seeds within | worst seed | cost (95 % over seeds) | success "
+        "| lowest | return | multiplier |",
+        "|---" * 9 + "|",
+    ]
+    for action, limit in product(config.actions, (*config.limits, None)):
+        mine = _select(runs, action, limit)
+        costs = episode_costs(mine)
+        kept = "" if limit is None else f"{(costs.mean(1) <= limit).sum()}/{len(mine)}"
+        middle = mean(costs.unsqueeze(-1), resample="seeds")
+        returns = torch.tensor([run["evaluation"]["return"][0] for run in mine])
+        multipliers = [run["history"][-1]["multiplier/collision"] for run in mine]
+        success = successes(mine)
+        lines.append(
+            f"| {action} | {'none (PPO)' if limit is None else f'{limit:g}'} | {kept} "
+            f"| {worst_seed(costs.unsqueeze(-1)).value.item():.2f} "
+            f"| {middle.value.item():.2f} [{middle.low.item():.2f}, {middle.high.item():.2f}] "
+            f"| {sum(success) / len(success):.1%} | {min(success):.1%} | {returns.mean():.2f} "
+            f"| {min(multipliers):.2f} to {max(multipliers):.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
+    """Draws the cost of each seed, with its 95 % interval, against the limit."""
+    columns = len(config.actions)
+    figure, axes = plt.subplots(1, columns, figsize=(5.4 * columns, 4.2), squeeze=False)
+    for axis, action in zip(axes[0], config.actions, strict=True):
+        ends = [min(config.limits) / 1.5, max(config.limits) * 1.5]
+        axis.plot(ends, ends, color="black", ls="--", label="limit")
+        axis.fill_between(ends, ends, 100, color="black", alpha=0.06)
+        for seed in range(config.seeds):
+            for limit in config.limits:
+                (mine,) = (r for r in _select(runs, action, limit) if r["seed"] == seed)
+                value, low, high = (max(x, _LEAST) for x in mine["evaluation"]["cost/collision"])
+                # Beside each other, not on top of each other.
+                x = limit * 1.06 ** (seed - (config.seeds - 1) / 2)
+                axis.plot([x, x], [low, high], color=COLOURS[1], alpha=0.5)
+                label = (
+                    "PPO-Lagrangian, one seed" if (seed, limit) == (0, config.limits[0]) else None
+                )
+                axis.plot(x, value, "o", color=COLOURS[1], ms=4, label=label)
+        ppo = mean(episode_costs(_select(runs, action, None)).flatten().unsqueeze(-1))
+        axis.axhline(ppo.value.item(), color=COLOURS[0], label="PPO")
+        axis.set(
+            xscale="log", yscale="log", xlim=ends, ylim=(_LEAST / 1.3, 40), title=action,
+            xlabel="cost limit", ylabel="evaluated episode cost",
+        )  # fmt: skip
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8, loc="upper left")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main(config: Config) -> None:
+    """Runs what is missing, then writes table, figure and results.json."""
+    runs = run_grid(run, jobs(config), workers=config.workers, name="sweep")
+    results = {
+        "config": dataclasses.asdict(config),
+        "defaults": dataclasses.asdict(train.Config()),
+        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
+        "runs": runs,
+    }
+    (config.out / "results.json").write_text(json.dumps(results, default=str))
+    (config.out / "table.md").write_text(table(runs, config))
+    plot(runs, config, config.out / "sweep.png")
+    print(f"\n{table(runs, config)}\nResults are in {config.out}.")
+
+
+def _name(action: train.Action, limit: float | None, seed: int) -> str:
+    return f"{action}-{'none' if limit is None else f'{limit:g}'}-{seed}"
+
+
+def _select(
+    runs: list[dict[str, Any]], action: train.Action, limit: float | None
+) -> list[dict[str, Any]]:
+    return [run for run in runs if run["action"] == action and run["limit"] == limit]
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

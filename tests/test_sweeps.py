@@ -1,0 +1,79 @@
+"""The sweep of limits and the multiplier profile, made small: what they run and what they draw."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from PIL import Image
+
+from experiments import multiplier_profile, sweep
+from experiments.grid import missing
+
+SMALL = {"seeds": 1, "frames": 4096, "eval_episodes": 32, "workers": 2}
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sweep")
+    config = sweep.Config(**SMALL, limits=(0.5,), actions=("cartesian",), out=out)
+    sweep.main(config)
+    return config
+
+
+def test_sweep_leaves_table_figure_and_results(swept):
+    results = json.loads((swept.out / "results.json").read_text())
+    assert [run["limit"] for run in results["runs"]] == [0.5, None]
+    safe, ppo = results["runs"]
+    assert safe["history"][-1]["multiplier/collision"] > 0
+    assert ppo["history"][-1]["multiplier/collision"] == 0
+    costs = sweep.episode_costs(results["runs"])
+    assert costs.shape == (2, 32)
+    assert costs[0].mean().item() == pytest.approx(safe["evaluation"]["cost/collision"][0])
+    assert (swept.out / "table.md").read_text() == sweep.table(results["runs"], swept)
+    with Image.open(swept.out / "sweep.png") as image:
+        assert image.width > 500
+    assert not missing(sweep.jobs(swept))
+    assert len(missing(sweep.jobs(dataclasses.replace(swept, seeds=3)))) == 4
+
+
+def made_up(limit, seed, costs, success):
+    return {
+        "action": "joint",
+        "limit": limit,
+        "seed": seed,
+        "history": [{"multiplier/collision": 2.0 * seed}],
+        "evaluation": {"success": [success, 0, 1], "return": [-3.0, -4, -2]},
+        "episodes": {"episode_cost": [[float(cost)] for cost in costs]},
+    }
+
+
+def test_sweep_counts_the_seeds_that_keep_the_limit():
+    config = sweep.Config(limits=(2.0,), actions=("joint",), seeds=2)
+    runs = [
+        made_up(2.0, 0, [0, 4], 1.0),  # exactly the limit
+        made_up(2.0, 1, [1, 4], 0.5),
+        made_up(None, 0, [9, 9], 1.0),
+        made_up(None, 1, [9, 9], 1.0),
+    ]
+    row = sweep.table(runs, config).splitlines()[2]
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells[:4] == ["joint", "2", "1/2", "2.50"]
+    assert cells[5:] == ["75.0%", "50.0%", "-3.00", "0.00 to 2.00"]
+
+
+def test_profile(tmp_path):
+    config = multiplier_profile.Config(**SMALL, multipliers=(0.0, 4.0), limits=(0.5,), out=tmp_path)
+    multiplier_profile.main(config)
+    runs = json.loads((tmp_path / "results.json").read_text())["runs"]
+    assert [(run["rule"], run["value"]) for run in runs] == [
+        ("fixed", 0.0), ("fixed", 4.0), ("dual-ascent", 0.5), ("pid", 0.5),
+    ]  # fmt: skip
+    last = [run["history"][-1]["multiplier/collision"] for run in runs]
+    assert last[:2] == [0.0, 4.0]
+    assert last[3] > last[2] > 0
+    assert (tmp_path / "table.md").read_text() == multiplier_profile.table(runs)
+    with Image.open(tmp_path / "profile.png") as image:
+        assert image.width > 500
+    found = multiplier_profile.points(runs)["fixed", 4.0]
+    torch.testing.assert_close(found[0, 1], runs[1]["evaluation"]["cost/collision"][0])
