@@ -79,8 +79,8 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
 
     Keyword Args:
         num_costs (int, optional): number k of costs. Defaults to ``1``.
-        sharpness (float, optional): the paper's t, in units of cost per standardized reward
-            advantage. Defaults to ``20.0``.
+        sharpness (float, optional): the paper's t: the larger, the closer to the limit the
+            barrier acts. Defaults to ``20.0``.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
