@@ -28,6 +28,17 @@ def test_it_writes_mean_cost_minus_limit_in_place(limit):
     assert loss.cost_violation.tolist() == [0.0, 0.0]
 
 
+def test_pessimism_adds_standard_errors():
+    loss, _ = make()
+    updater = ViolationUpdater(loss, cost_limit=1.0, pessimism=2.0)
+    updater.step(torch.tensor([[2.0, 0.0], [4.0, 0.0]]))
+    torch.testing.assert_close(loss.cost_violation, torch.tensor([2.0 + 2.0 * 1.0, -1.0]))
+    updater.step(torch.tensor([[2.0, 0.0]]))  # One episode has no standard error.
+    assert loss.cost_violation.tolist() == [1.0, -1.0]
+    with pytest.raises(ValueError, match="pessimism must be finite and not negative, got -1"):
+        ViolationUpdater(loss, cost_limit=1.0, pessimism=-1.0)
+
+
 def test_without_an_episode_nothing_changes():
     loss, updater = make()
     updater.step(torch.tensor([[3.0, 0.0]]))
