@@ -1,16 +1,30 @@
 """Constrained losses and the rules that move their multipliers. Needs TorchRL only."""
 
 from torchrl_safe.objectives.cost_gae import CostGAE
+from torchrl_safe.objectives.crpo import CRPOLoss
+from torchrl_safe.objectives.cup import CUPLoss
+from torchrl_safe.objectives.focops import FOCOPSLoss
 from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.ipo import IPOLoss
+from torchrl_safe.objectives.lagrangian import LagrangianLoss
 from torchrl_safe.objectives.multipliers import DualAscent, MultiplierUpdater
+from torchrl_safe.objectives.p3o import P3OLoss
 from torchrl_safe.objectives.pid_control import PIDControl
 from torchrl_safe.objectives.ppo_lagrangian import PPOLagrangianLoss
+from torchrl_safe.objectives.violation import ViolationUpdater
 
 __all__ = [
+    "CRPOLoss",
+    "CUPLoss",
     "CostGAE",
     "DualAscent",
+    "FOCOPSLoss",
+    "IPOLoss",
+    "LagrangianLoss",
     "MultiplierUpdater",
+    "P3OLoss",
     "PIDControl",
     "PPOLagrangianLoss",
+    "ViolationUpdater",
     "penalized_advantage",
 ]

@@ -11,8 +11,10 @@ from torch import Tensor
 from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
+from torchrl_safe.objectives._cost_updater import CostUpdater
 
-class MultiplierUpdater(abc.ABC):
+
+class MultiplierUpdater(CostUpdater):
     """Moves the multipliers of a loss towards its cost limits, once for each collected batch.
 
     A rule is one method, :meth:`next_multiplier`; checking the costs, projecting on
@@ -54,6 +56,8 @@ class MultiplierUpdater(abc.ABC):
         tensor([2.5000])
     """
 
+    _buffer = "lagrange_multiplier"
+
     def __init__(
         self,
         loss_module: LossModule,
@@ -63,77 +67,35 @@ class MultiplierUpdater(abc.ABC):
         pessimism: float = 0.0,
         normalize: bool = False,
     ) -> None:
-        if not isinstance(loss_module, LossModule):
-            raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
-        multiplier = dict(loss_module.named_buffers(recurse=False)).get("lagrange_multiplier")
-        if multiplier is None:
-            raise ValueError(f"{type(loss_module).__name__} has no lagrange_multiplier buffer.")
-        limit = torch.as_tensor(cost_limit, dtype=multiplier.dtype)
-        if limit.shape not in ((), multiplier.shape):
-            raise ValueError(
-                f"cost_limit must be one number or one for each of the {len(multiplier)} costs, "
-                f"got shape {tuple(limit.shape)}."
-            )
-        if not limit.isfinite().all():
-            raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
+        super().__init__(loss_module, cost_limit=cost_limit, pessimism=pessimism)
         if max_multiplier is not None and not max_multiplier > 0:
             raise ValueError(f"max_multiplier must be positive, got {max_multiplier}.")
-        if not 0 <= pessimism < float("inf"):
-            raise ValueError(f"pessimism must be finite and not negative, got {pessimism}.")
-        if normalize and (limit < 0).any():
+        if normalize and (self.cost_limit < 0).any():
             raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
-        self.loss_module = loss_module
-        self.cost_limit = limit.expand_as(multiplier).clone()
         self.max_multiplier = max_multiplier
-        self.pessimism = pessimism
         self.normalize = normalize
 
-    @torch.no_grad()
-    def step(self, episode_cost: Tensor) -> None:
-        """Moves the multipliers once.
-
-        Args:
-            episode_cost (Tensor): undiscounted cost of each episode that ended in the batch,
-                shape ``(E, k)``. With ``E = 0`` nothing changes.
-
-        Raises:
-            ValueError: if the shape is wrong or a cost is NaN or infinite; nothing has changed
-                then.
-
-        With :class:`~torchrl.envs.RewardSum` a collector's batch gives it as
-        ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``.
-        """
-        multiplier = self.loss_module.lagrange_multiplier
-        if episode_cost.ndim != 2 or episode_cost.shape[-1:] != multiplier.shape:
+    def _move(self, buffer: Tensor, violation: Tensor) -> None:
+        proposal = self.next_multiplier(buffer, violation)
+        if proposal.shape != buffer.shape or not proposal.isfinite().all():
             raise ValueError(
-                f"episode_cost must have shape (E, {len(multiplier)}), got "
-                f"{tuple(episode_cost.shape)}."
+                f"next_multiplier must return {len(buffer)} finite numbers, got {proposal}."
             )
-        if not episode_cost.isfinite().all():
-            raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
-        if not len(episode_cost):
-            return
-        violation = self._violation(episode_cost.to(multiplier))
-        proposal = self.next_multiplier(multiplier, violation)
-        if proposal.shape != multiplier.shape or not proposal.isfinite().all():
-            raise ValueError(
-                f"next_multiplier must return {len(multiplier)} finite numbers, got {proposal}."
-            )
-        multiplier.copy_(proposal.clamp(0, self.max_multiplier))
+        buffer.copy_(proposal.clamp(0, self.max_multiplier))
 
     def _violation(self, episode_cost: Tensor) -> Tensor:
-        mean, limit = episode_cost.mean(0), self.cost_limit.to(episode_cost)
+        violation = super()._violation(episode_cost)
+        if not self.normalize:
+            return violation
+        limit = self.cost_limit.to(episode_cost)
+        cost = self._pessimistic_cost(episode_cost)
         # One episode says nothing of the spread; its cost is a spread of the right size.
         single = len(episode_cost) == 1
-        spread = mean if single else episode_cost.std(0)
-        error = torch.zeros_like(mean) if single else spread / len(episode_cost) ** 0.5
-        cost = mean + self.pessimism * error
-        if not self.normalize:
-            return cost - limit
+        spread = episode_cost.mean(0) if single else episode_cost.std(0)
         spread = torch.maximum(spread, limit)
         # Without any spread and with a limit of 0, the cost itself is all there is to measure by.
         scale = torch.maximum(cost, limit) * torch.where(spread > 0, spread, cost)
-        return torch.where(scale > 0, (cost - limit) / scale, 0.0)
+        return torch.where(scale > 0, violation / scale, 0.0)
 
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
@@ -149,28 +111,15 @@ class MultiplierUpdater(abc.ABC):
         """
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the state of the rule; the multipliers are in the state of the loss."""
         return {
-            "cost_limit": self.cost_limit.clone(),
+            **super().state_dict(),
             "max_multiplier": self.max_multiplier,
-            "pessimism": self.pessimism,
             "normalize": self.normalize,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Loads a state that :meth:`state_dict` returned.
-
-        Raises:
-            ValueError: if the state is of another number of costs.
-        """
-        if state_dict["cost_limit"].shape != self.cost_limit.shape:
-            raise ValueError(
-                f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "
-                f"{len(self.cost_limit)}."
-            )
-        self.cost_limit = state_dict["cost_limit"].clone()
+        super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
-        self.pessimism = state_dict["pessimism"]
         self.normalize = state_dict["normalize"]
 
 
