@@ -21,100 +21,15 @@ complementary slackness its multiplier is 0.
 """
 
 import math
-import warnings
 from functools import partial
 
 import pytest
-import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torch import nn
-from torchrl.data import Composite, LazyTensorStorage, OneHot, ReplayBuffer, Unbounded
-from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
-from torchrl.envs import EnvBase
-from torchrl.modules import OneHotCategorical, ProbabilisticActor, ValueOperator
+from cmdp import LIMIT, train
 
 from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss
 
-with warnings.catch_warnings():  # TorchRL 0.14 deprecates a base class that it still derives from.
-    warnings.filterwarnings("ignore", "Creating .* WeightUpdaterBase", DeprecationWarning)
-    from torchrl.collectors import Collector
-
-LIMIT = 0.3
-ENVS = 512
-
-
-class TwoActions(EnvBase):
-    """Many copies of the problem side by side."""
-
-    def __init__(self):
-        super().__init__(batch_size=[ENVS])
-        self.observation_spec = Composite(observation=Unbounded((ENVS, 1)), shape=[ENVS])
-        self.action_spec = OneHot(2, shape=(ENVS, 2))
-        self.reward_spec = Composite(
-            reward=Unbounded((ENVS, 1)), cost=Unbounded((ENVS, 2)), shape=[ENVS]
-        )
-
-    def _reset(self, tensordict=None, **kwargs):
-        return TensorDict(observation=torch.ones(ENVS, 1), batch_size=[ENVS])
-
-    def _step(self, tensordict):
-        cost = tensordict["action"].float()
-        done = torch.ones(ENVS, 1, dtype=torch.bool)
-        return TensorDict(
-            observation=torch.ones(ENVS, 1),
-            reward=cost[:, :1],
-            cost=cost,
-            done=done,
-            terminated=done,
-            batch_size=[ENVS],
-        )
-
-    def _set_seed(self, seed):
-        torch.manual_seed(seed)
-
-
-def train(seed, rule, batches):
-    """Share of action A and multipliers, batch by batch; without a rule they stay at 0."""
-    torch.manual_seed(seed)
-    actor = ProbabilisticActor(
-        TensorDictModule(nn.Linear(1, 2), ["observation"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=OneHotCategorical,
-        return_log_prob=True,
-    )
-    critic = ValueOperator(nn.Linear(1, 1), in_keys=["observation"])
-    cost_critic = ValueOperator(nn.Linear(1, 2), in_keys=["observation"], out_keys=["cost_value"])
-    loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=2, entropy_bonus=False)
-    updater = rule(loss, cost_limit=torch.tensor([LIMIT, 0.9])) if rule else None
-    optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
-    collector = Collector(
-        TwoActions(),
-        actor,
-        frames_per_batch=ENVS,
-        total_frames=batches * ENVS,
-        auto_register_policy_transforms=False,
-    )
-    buffer = ReplayBuffer(
-        storage=LazyTensorStorage(ENVS), sampler=SamplerWithoutReplacement(), batch_size=ENVS // 2
-    )
-    shares, multipliers = [], []
-    for batch in collector:
-        if updater is not None:
-            # Every episode is one step long: its cost is the cost of the step.
-            updater.step(batch["next", "cost"][batch["next", "done"].squeeze(-1)])
-        buffer.extend(loss.estimate_advantages(batch).reshape(-1))
-        for _ in range(2):
-            for minibatch in buffer:
-                losses = loss(minibatch)
-                sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-                optimizer.step()
-                optimizer.zero_grad()
-        shares.append(batch["action"][..., 0].float().mean())
-        multipliers.append(loss.lagrange_multiplier.clone())
-    collector.shutdown()
-    return torch.stack(shares), torch.stack(multipliers)
-
+make_loss = partial(PPOLagrangianLoss, num_costs=2, entropy_bonus=False)
+train_ppo = partial(train, make_loss=make_loss, read=lambda loss: loss.lagrange_multiplier)
 
 RULES = {
     "dual-ascent": partial(DualAscent, lr=1.0),
@@ -124,7 +39,7 @@ RULES = {
 
 @pytest.fixture(scope="module")
 def trained():
-    return {name: train(seed=0, rule=rule, batches=240) for name, rule in RULES.items()}
+    return {name: train_ppo(seed=0, rule=rule, batches=240) for name, rule in RULES.items()}
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -156,6 +71,6 @@ def test_pid_control_damps_the_circling(trained):
 
 
 def test_without_the_multiplier_the_limit_is_exceeded():
-    shares, multipliers = train(seed=0, rule=None, batches=60)
+    shares, multipliers = train_ppo(seed=0, rule=None, batches=60)
     assert shares[-20:].mean() > 0.95
     assert (multipliers == 0).all()

@@ -1,25 +1,39 @@
 """Constrained losses and the rules that move their multipliers. Needs TorchRL only."""
 
 from torchrl_safe.objectives.cost_gae import CostGAE
+from torchrl_safe.objectives.crpo import CRPOLoss
+from torchrl_safe.objectives.cup import CUPLoss
+from torchrl_safe.objectives.focops import FOCOPSLoss
 from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.ipo import IPOLoss
+from torchrl_safe.objectives.lagrangian import LagrangianLoss
 from torchrl_safe.objectives.multipliers import DualAscent, MultiplierUpdater
+from torchrl_safe.objectives.p3o import P3OLoss
 from torchrl_safe.objectives.pid_control import PIDControl
 from torchrl_safe.objectives.ppo_lagrangian import PPOLagrangianLoss
 from torchrl_safe.objectives.trust_region_loss import TrustRegionLoss
 from torchrl_safe.objectives.trust_region_methods import CPO, PCPO, TRPO, TrustRegionMethod
 from torchrl_safe.objectives.trust_region_step import TrustRegionStep
+from torchrl_safe.objectives.violation import ViolationUpdater
 
 __all__ = [
     "CPO",
     "PCPO",
     "TRPO",
+    "CRPOLoss",
+    "CUPLoss",
     "CostGAE",
     "DualAscent",
+    "FOCOPSLoss",
+    "IPOLoss",
+    "LagrangianLoss",
     "MultiplierUpdater",
+    "P3OLoss",
     "PIDControl",
     "PPOLagrangianLoss",
     "TrustRegionLoss",
     "TrustRegionMethod",
     "TrustRegionStep",
+    "ViolationUpdater",
     "penalized_advantage",
 ]

@@ -6,7 +6,11 @@ from torch import Tensor
 
 
 def penalized_advantage(
-    advantage: Tensor, cost_advantage: Tensor, lagrange_multiplier: Tensor
+    advantage: Tensor,
+    cost_advantage: Tensor,
+    lagrange_multiplier: Tensor,
+    *,
+    rescale: bool = True,
 ) -> Tensor:
     r"""Mixes the reward advantage with the advantages of the costs.
 
@@ -21,6 +25,9 @@ def penalized_advantage(
         advantage (Tensor): reward advantage, shape ``(*B, 1)``.
         cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
         lagrange_multiplier (Tensor): non-negative multipliers, shape ``(k,)``.
+
+    Keyword Args:
+        rescale (bool, optional): divide by the denominator. Defaults to ``True``.
 
     Returns:
         The mixed advantage, shape ``(*B, 1)``.
@@ -46,5 +53,5 @@ def penalized_advantage(
             "advantage must have shape (*B, 1) and cost_advantage (*B, k) with the same *B, got "
             f"{tuple(advantage.shape)} and {tuple(cost_advantage.shape)}."
         )
-    penalty = (lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
-    return (advantage - penalty) / (1 + lagrange_multiplier.sum())
+    penalized = advantage - (lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
+    return penalized / (1 + lagrange_multiplier.sum()) if rescale else penalized

@@ -11,8 +11,10 @@ from torch import Tensor
 from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
+from torchrl_safe.objectives._cost_updater import CostUpdater
 
-class MultiplierUpdater(abc.ABC):
+
+class MultiplierUpdater(CostUpdater):
     """Moves the multipliers of a loss towards its cost limits, once for each collected batch.
 
     A rule is one method, :meth:`next_multiplier`; checking the costs, projecting on
@@ -43,6 +45,8 @@ class MultiplierUpdater(abc.ABC):
         tensor([2.5000])
     """
 
+    _buffer = "lagrange_multiplier"
+
     def __init__(
         self,
         loss_module: LossModule,
@@ -50,57 +54,18 @@ class MultiplierUpdater(abc.ABC):
         cost_limit: float | Tensor,
         max_multiplier: float | None = None,
     ) -> None:
-        if not isinstance(loss_module, LossModule):
-            raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
-        multiplier = dict(loss_module.named_buffers(recurse=False)).get("lagrange_multiplier")
-        if multiplier is None:
-            raise ValueError(f"{type(loss_module).__name__} has no lagrange_multiplier buffer.")
-        limit = torch.as_tensor(cost_limit, dtype=multiplier.dtype)
-        if limit.shape not in ((), multiplier.shape):
-            raise ValueError(
-                f"cost_limit must be one number or one for each of the {len(multiplier)} costs, "
-                f"got shape {tuple(limit.shape)}."
-            )
-        if not limit.isfinite().all():
-            raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
+        super().__init__(loss_module, cost_limit=cost_limit)
         if max_multiplier is not None and not max_multiplier > 0:
             raise ValueError(f"max_multiplier must be positive, got {max_multiplier}.")
-        self.loss_module = loss_module
-        self.cost_limit = limit.expand_as(multiplier).clone()
         self.max_multiplier = max_multiplier
 
-    @torch.no_grad()
-    def step(self, episode_cost: Tensor) -> None:
-        """Moves the multipliers once.
-
-        Args:
-            episode_cost (Tensor): undiscounted cost of each episode that ended in the batch,
-                shape ``(E, k)``. With ``E = 0`` nothing changes.
-
-        Raises:
-            ValueError: if the shape is wrong or a cost is NaN or infinite; nothing has changed
-                then.
-
-        With :class:`~torchrl.envs.RewardSum` a collector's batch gives it as
-        ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``.
-        """
-        multiplier = self.loss_module.lagrange_multiplier
-        if episode_cost.ndim != 2 or episode_cost.shape[-1:] != multiplier.shape:
+    def _move(self, buffer: Tensor, violation: Tensor) -> None:
+        proposal = self.next_multiplier(buffer, violation)
+        if proposal.shape != buffer.shape or not proposal.isfinite().all():
             raise ValueError(
-                f"episode_cost must have shape (E, {len(multiplier)}), got "
-                f"{tuple(episode_cost.shape)}."
+                f"next_multiplier must return {len(buffer)} finite numbers, got {proposal}."
             )
-        if not episode_cost.isfinite().all():
-            raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
-        if not len(episode_cost):
-            return
-        mean_cost = episode_cost.to(multiplier).mean(0)
-        proposal = self.next_multiplier(multiplier, mean_cost - self.cost_limit.to(multiplier))
-        if proposal.shape != multiplier.shape or not proposal.isfinite().all():
-            raise ValueError(
-                f"next_multiplier must return {len(multiplier)} finite numbers, got {proposal}."
-            )
-        multiplier.copy_(proposal.clamp(0, self.max_multiplier))
+        buffer.copy_(proposal.clamp(0, self.max_multiplier))
 
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
@@ -115,21 +80,10 @@ class MultiplierUpdater(abc.ABC):
         """
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the state of the rule; the multipliers are in the state of the loss."""
-        return {"cost_limit": self.cost_limit.clone(), "max_multiplier": self.max_multiplier}
+        return {**super().state_dict(), "max_multiplier": self.max_multiplier}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Loads a state that :meth:`state_dict` returned.
-
-        Raises:
-            ValueError: if the state is of another number of costs.
-        """
-        if state_dict["cost_limit"].shape != self.cost_limit.shape:
-            raise ValueError(
-                f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "
-                f"{len(self.cost_limit)}."
-            )
-        self.cost_limit = state_dict["cost_limit"].clone()
+        super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
 
 

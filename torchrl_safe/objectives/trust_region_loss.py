@@ -13,9 +13,10 @@ from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives._cost_critic import CostKeys, get_or_raise
 from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
+from torchrl_safe.objectives.violation import ViolationMixin
 
 
-class TrustRegionLoss(MixedAdvantageMixin, PPOLoss):
+class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
     r"""Unclipped surrogates of the reward and of k costs, for TRPO-Lagrangian, CPO and PCPO.
 
     With the ratio :math:`w = \pi_\theta(a|s) / \pi_{\theta_k}(a|s)`, ``"loss_objective"`` is
@@ -35,9 +36,10 @@ class TrustRegionLoss(MixedAdvantageMixin, PPOLoss):
     keys and outputs it keeps; with every multiplier at zero its outputs and gradients are those
     of ``PPOLoss``, bit for bit. The differences are those of
     :class:`~torchrl_safe.objectives.PPOLagrangianLoss` from ``ClipPPOLoss``: the cost critic,
-    :meth:`estimate_advantages` for whole batches, and the buffer ``lagrange_multiplier`` of
-    shape ``(k,)``, which any :class:`~torchrl_safe.objectives.MultiplierUpdater` moves for
-    TRPO-Lagrangian and which stays at zero for CPO and PCPO.
+    :meth:`estimate_advantages` for whole batches, and a buffer of shape ``(k,)`` that an updater
+    writes once for each of them. For TRPO-Lagrangian it is ``lagrange_multiplier`` and any
+    :class:`~torchrl_safe.objectives.MultiplierUpdater`; for CPO and PCPO ``cost_violation`` and
+    the :class:`~torchrl_safe.objectives.ViolationUpdater`, with the multipliers left at zero.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): policy operator.
@@ -63,15 +65,16 @@ class TrustRegionLoss(MixedAdvantageMixin, PPOLoss):
     ``cost_value``, ``cost_advantage``, ``cost_value_target``.
 
     Outputs beside those of ``PPOLoss``: ``loss_cost_critic``, ``cost_explained_variance`` (mean
-    over the costs) and ``lagrange_multiplier_0`` ... ``lagrange_multiplier_{k-1}``, and with
-    ``clip_value`` also ``cost_value_clip_fraction``.
+    over the costs), ``lagrange_multiplier_0`` ... ``lagrange_multiplier_{k-1}``,
+    ``cost_violation_0`` ... ``cost_violation_{k-1}``, and with ``clip_value`` also
+    ``cost_value_clip_fraction``.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
         >>> from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
-        >>> from torchrl_safe.objectives import CPO, TrustRegionStep
+        >>> from torchrl_safe.objectives import CPO, TrustRegionStep, ViolationUpdater
         >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
         >>> actor = ProbabilisticActor(
         ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
@@ -86,7 +89,8 @@ class TrustRegionLoss(MixedAdvantageMixin, PPOLoss):
         >>> loss = TrustRegionLoss(actor, critic, cost_critic, entropy_bonus=False)
         >>> critics = [loss.critic_network_params, loss.cost_critic_network_params]
         >>> optimizer = torch.optim.Adam([p for params in critics for p in params.parameters()])
-        >>> actor_step = TrustRegionStep(loss, CPO(cost_limit=1.0), max_kl=0.01)
+        >>> updater = ViolationUpdater(loss, cost_limit=1.0)
+        >>> actor_step = TrustRegionStep(loss, CPO(), max_kl=0.01)
         >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
         >>> done[:, -1] = True
         >>> data = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
@@ -100,8 +104,9 @@ class TrustRegionLoss(MixedAdvantageMixin, PPOLoss):
         ...     terminated=done,
         ...     batch_size=[3, 5],
         ... )
+        >>> updater.step(torch.tensor([[2.0], [3.0], [1.0]]))  # one cost for each episode
         >>> data = loss.estimate_advantages(data).reshape(-1)
-        >>> info = actor_step.step(data, episode_cost=torch.tensor([[2.0], [3.0], [1.0]]))
+        >>> info = actor_step.step(data)
         >>> bool(info["kl"] <= 0.01)
         True
         >>> losses = loss(data)

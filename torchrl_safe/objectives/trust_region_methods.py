@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import abc
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -27,6 +29,7 @@ class TrustRegionProblem:
             method without constraint, as the next.
         natural_cost_gradient (Tensor): :math:`H^{-1} b`, shape ``(n,)``.
         violation (float): :math:`c`, cost minus limit in the unit of the cost surrogate.
+        product (callable): from a vector :math:`x` of shape ``(n,)`` to :math:`H x`.
     """
 
     gradient: Tensor
@@ -35,6 +38,7 @@ class TrustRegionProblem:
     cost_gradient: Tensor
     natural_cost_gradient: Tensor
     violation: float
+    product: Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -55,21 +59,20 @@ class TrustRegionSolution:
 class TrustRegionMethod(abc.ABC):
     """A step rule: a frozen dataclass called with a :class:`TrustRegionProblem`.
 
-    ``cost_limit`` is the limit of the undiscounted episode cost, or ``None`` for a method
-    without constraint, to which no cost is shown.
+    ``constrained`` tells whether it heeds the cost limit; the cost is shown to no other.
 
     Examples:
         >>> from dataclasses import dataclass
         >>> @dataclass(frozen=True)
         ... class PlainGradient(TrustRegionMethod):
         ...     lr: float = 0.1
-        ...     cost_limit = None
+        ...     constrained = False
         ...
         ...     def __call__(self, problem):
         ...         return TrustRegionSolution(self.lr * problem.gradient)
     """
 
-    cost_limit: float | None
+    constrained: ClassVar[bool]
 
     @abc.abstractmethod
     def __call__(self, problem: TrustRegionProblem) -> TrustRegionSolution:
@@ -89,11 +92,12 @@ class TRPO(TrustRegionMethod):
         >>> import torch
         >>> zero = torch.zeros(2)
         >>> gradient = torch.tensor([3.0, 4.0])
-        >>> TRPO()(TrustRegionProblem(gradient, gradient, 0.5, zero, zero, 0.0)).step
+        >>> identity = torch.clone  # the Fisher matrix
+        >>> TRPO()(TrustRegionProblem(gradient, gradient, 0.5, zero, zero, 0.0, identity)).step
         tensor([0.6000, 0.8000])
     """
 
-    cost_limit = None
+    constrained = False
 
     def __call__(self, problem: TrustRegionProblem) -> TrustRegionSolution:
         weight = trpo_weight(_dot(problem.gradient, problem.natural_gradient), problem.max_kl)
@@ -109,24 +113,24 @@ class CPO(TrustRegionMethod):
     with k of them the dual has 2^k sets of active constraints and no closed form. For more,
     add up the costs, or use :class:`TRPO` with a multiplier for each.
 
-    Args:
-        cost_limit (float): limit of the expected undiscounted episode cost.
-
-    Raises:
-        ValueError: if ``cost_limit`` is not one finite number.
-
     Examples:
         >>> import torch
         >>> gradient, cost_gradient = torch.tensor([1.0, 0.0]), torch.tensor([1.0, 1.0])
-        >>> identity_fisher = (gradient, gradient, 0.5, cost_gradient, cost_gradient)
-        >>> CPO(cost_limit=25.0)(TrustRegionProblem(*identity_fisher, violation=0.0)).step
+        >>> CPO()(
+        ...     TrustRegionProblem(
+        ...         gradient=gradient,
+        ...         natural_gradient=gradient,
+        ...         max_kl=0.5,
+        ...         cost_gradient=cost_gradient,
+        ...         natural_cost_gradient=cost_gradient,
+        ...         violation=0.0,
+        ...         product=torch.clone,  # the Fisher matrix is the identity
+        ...     )
+        ... ).step
         tensor([ 0.7071, -0.7071])
     """
 
-    cost_limit: float
-
-    def __post_init__(self) -> None:
-        _check_limit(self.cost_limit)
+    constrained = True
 
     def __call__(self, problem: TrustRegionProblem) -> TrustRegionSolution:
         weights = cpo_weights(
@@ -149,32 +153,34 @@ class PCPO(TrustRegionMethod):
     """Projection-based constrained policy optimization: a TRPO step, projected on the limit.
 
     Yang et al. 2020 (https://arxiv.org/abs/2010.03152); see
-    :func:`~torchrl_safe.objectives.trust_region.pcpo_weight`. The projection may leave the trust
-    region, above all far above the limit; the line search then shortens the step. It has one
-    cost, for the reason given at :class:`CPO`: the projection on several half-spaces has no
-    closed form either.
+    :func:`~torchrl_safe.objectives.trust_region.pcpo_weight`. Far above the limit the projection
+    lies outside the trust region; the step then ends at its edge, on the way there (in the paper
+    nothing bounds it). It has one cost, for the reason given at :class:`CPO`: the projection on
+    several half-spaces has no closed form either.
 
     Args:
-        cost_limit (float): limit of the expected undiscounted episode cost.
         kl_projection (bool, optional): project to the point of least divergence, in the metric
             of the Fisher matrix; if ``False``, to the nearest parameters. Defaults to ``True``.
-
-    Raises:
-        ValueError: if ``cost_limit`` is not one finite number.
 
     Examples:
         >>> import torch
         >>> gradient, cost_gradient = torch.tensor([1.0, 0.0]), torch.tensor([1.0, 1.0])
-        >>> identity_fisher = (gradient, gradient, 0.5, cost_gradient, cost_gradient)
-        >>> PCPO(cost_limit=25.0)(TrustRegionProblem(*identity_fisher, violation=0.0)).step
+        >>> PCPO()(
+        ...     TrustRegionProblem(
+        ...         gradient=gradient,
+        ...         natural_gradient=gradient,
+        ...         max_kl=0.5,
+        ...         cost_gradient=cost_gradient,
+        ...         natural_cost_gradient=cost_gradient,
+        ...         violation=0.0,
+        ...         product=torch.clone,  # the Fisher matrix is the identity
+        ...     )
+        ... ).step
         tensor([ 0.5000, -0.5000])
     """
 
-    cost_limit: float
     kl_projection: bool = True
-
-    def __post_init__(self) -> None:
-        _check_limit(self.cost_limit)
+    constrained = True
 
     def __call__(self, problem: TrustRegionProblem) -> TrustRegionSolution:
         reward = trpo_weight(_dot(problem.gradient, problem.natural_gradient), problem.max_kl)
@@ -188,13 +194,11 @@ class PCPO(TrustRegionMethod):
         )
         if cost > 0:
             step = step - cost * normal
+            kl = 0.5 * _dot(step, problem.product(step))
+            if kl > problem.max_kl:
+                step = math.sqrt(problem.max_kl / kl) * step
         return TrustRegionSolution(step, constraint_active=cost > 0)
 
 
 def _dot(left: Tensor, right: Tensor) -> float:
     return float(left @ right)
-
-
-def _check_limit(cost_limit: float) -> None:
-    if not isinstance(cost_limit, int | float) or not math.isfinite(cost_limit):
-        raise ValueError(f"cost_limit must be one finite number, got {cost_limit!r}.")

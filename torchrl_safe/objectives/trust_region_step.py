@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -44,27 +43,31 @@ class TrustRegionStep:
 
     - the mean divergence from the policy before the step is at most ``max_kl``;
     - the reward surrogate has grown, if the step promises that and is no recovery;
-    - with a cost limit, the cost surrogate has grown by no more than the distance to the limit,
+    - under a constraint, the cost surrogate has grown by no more than the distance to the limit,
       or not at all above it
 
     (Achiam et al. 2017, https://arxiv.org/abs/1705.10528, section 6.1). If no length will do, or
     the damped Fisher matrix is found not to be positive definite, the parameters stay as they
     were, bit for bit, and ``rejected_steps`` or ``indefinite_steps`` counts it.
 
-    The surrogates are means over steps, the limit is one of whole episodes: the violation that
-    ``method`` gets is the mean episode cost minus the limit, divided by the mean length of an
-    episode, which stands for the :math:`1 / (1 - \gamma)` of the paper's equation 10.
+    The surrogates are means over steps, a limit is one of whole episodes: the loss's
+    ``cost_violation`` is divided by the length of an episode before ``method`` gets it, which is
+    the factor :math:`1 - \gamma` of the paper's equation 10.
 
     Args:
         loss_module (PPOLoss): :class:`~torchrl.objectives.PPOLoss` for TRPO alone, else a
             :class:`~torchrl_safe.objectives.TrustRegionLoss`. The actor shares no parameter
             with a critic, or the step moves that too. Of the losses, ``"loss_objective"`` and,
-            if there is one, ``"loss_entropy"`` are the surrogate.
+            if there is one, ``"loss_entropy"`` are the surrogate. (An entropy estimated from
+            samples makes the line search noisy: better ``entropy_bonus=False``.)
         method (TrustRegionMethod, optional): :class:`~torchrl_safe.objectives.CPO`,
             :class:`~torchrl_safe.objectives.PCPO`, or by default
             :class:`~torchrl_safe.objectives.TRPO`, which with multipliers is TRPO-Lagrangian.
 
     Keyword Args:
+        episode_length (float, optional): mean number of steps of an episode, with which
+            a surrogate becomes the change of an episode's cost. Defaults to
+            ``1 / (1 - gamma)`` of the cost's value estimator.
         max_kl (float, optional): bound on the mean divergence of one step, in nats.
             Defaults to ``0.01``.
         damping (float, optional): multiple of the identity added to the Fisher matrix.
@@ -113,6 +116,7 @@ class TrustRegionStep:
         loss_module: PPOLoss,
         method: TrustRegionMethod = TRPO(),
         *,
+        episode_length: float | None = None,
         max_kl: float = 0.01,
         damping: float = 0.1,
         cg_iterations: int = 10,
@@ -121,6 +125,11 @@ class TrustRegionStep:
     ) -> None:
         _check_loss(loss_module, method)
         for name, value, allowed in (
+            (
+                "episode_length",
+                episode_length,
+                episode_length is None or 0 < episode_length < math.inf,
+            ),
             ("max_kl", max_kl, 0 < max_kl < math.inf),
             ("damping", damping, 0 <= damping < math.inf),
             ("cg_iterations", cg_iterations, cg_iterations >= 1),
@@ -131,6 +140,7 @@ class TrustRegionStep:
                 raise ValueError(f"{name} is out of its range, got {value}.")
         self.loss_module = loss_module
         self.method = method
+        self.episode_length = episode_length
         self.max_kl = max_kl
         self.damping = damping
         self.cg_iterations = cg_iterations
@@ -139,54 +149,32 @@ class TrustRegionStep:
         self.rejected_steps = 0
         self.indefinite_steps = 0
         self.recovery_steps = 0
-        self.waiting_steps = 0
-        # NaN until an episode has ended.
-        self.mean_episode_cost = math.nan
-        self.mean_episode_length = math.nan
 
-    def step(
-        self,
-        tensordict: TensorDictBase,
-        episode_cost: Tensor | None = None,
-        *,
-        episode_length: float | Tensor | None = None,
-    ) -> TensorDict:
+    def step(self, tensordict: TensorDictBase) -> TensorDict:
         """Moves the actor once.
 
         Args:
             tensordict (TensorDictBase): the whole batch, collected by the present actor, with
-                ``advantage`` and, under a cost limit, ``cost_advantage``, as
-                ``estimate_advantages`` writes them.
-            episode_cost (Tensor, optional): undiscounted cost of each episode that ended in the
-                batch, shape ``(E, 1)``. A method with a limit needs it, others ignore it. With
-                ``E = 0`` the last mean stands, and until an episode has ended the actor is not
-                moved (``waiting_steps`` counts that).
-
-        Keyword Args:
-            episode_length (float or Tensor, optional): length of those episodes in steps, one
-                number or their lengths. Defaults to the number of steps in the batch divided by
-                E, right on average if the batch holds nothing but valid steps.
+                ``advantage`` and, for a constrained method, ``cost_advantage``, as
+                ``estimate_advantages`` writes them. Give the batch's episode costs to the updater
+                of the loss before.
 
         Returns:
             Numbers to log, each of shape ``()``: ``kl``, ``surrogate_gain``,
-            ``cost_surrogate_change`` (0 without a limit), ``step_fraction`` that the line search
-            let stand (0 if the actor has not moved), ``constraint_active``, and the counts
-            ``rejected_steps``, ``indefinite_steps``, ``recovery_steps``, ``waiting_steps``.
+            ``cost_surrogate_change`` (0 without a constraint), ``step_fraction`` that the line
+            search let stand (0 if the actor has not moved), ``constraint_active``, and the counts
+            ``rejected_steps``, ``indefinite_steps`` and ``recovery_steps``.
 
         Raises:
             KeyError: if an advantage is missing.
-            ValueError: if the gradient of a surrogate is not finite, ``episode_cost`` is missing
-                or has a wrong shape or a value that is not finite; the actor has not changed then.
+            ValueError: if the gradient of a surrogate is not finite, or the length of an episode
+                is not known; nothing has changed then.
             NotImplementedError: if the divergence of the policy has no closed form.
         """
         keys = self.loss_module.tensor_keys
         get_or_raise(tensordict, keys.advantage)
-        if self.method.cost_limit is not None:
+        if self.method.constrained:
             get_or_raise(tensordict, keys.cost_advantage)
-            self._read_costs(episode_cost, episode_length, tensordict.numel())
-            if math.isnan(self.mean_episode_cost):
-                self.waiting_steps += 1
-                return self._report()
         with torch.enable_grad(), set_recurrent_mode(True):
             try:
                 problem = self._local_problem(tensordict)
@@ -195,48 +183,31 @@ class TrustRegionStep:
                 return self._report()
             return self._search(tensordict, problem, self.method(problem))
 
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the counts and the last known episodes; the actor is in the state of the loss."""
-        return {name: getattr(self, name) for name in _STATE}
+    def state_dict(self) -> dict[str, int]:
+        """Returns the counts; the actor is in the state of the loss."""
+        return {name: getattr(self, name) for name in _COUNTS}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
         """Loads a state that :meth:`state_dict` returned."""
-        for name in _STATE:
+        for name in _COUNTS:
             setattr(self, name, state_dict[name])
 
-    @property
-    def violation(self) -> float:
-        """Mean episode cost minus limit, per step of an episode; NaN before the first episode."""
-        if self.method.cost_limit is None:
+    def _violation(self) -> float:
+        if not self.method.constrained:
             return 0.0
-        return (self.mean_episode_cost - self.method.cost_limit) / self.mean_episode_length
-
-    def _read_costs(
-        self, episode_cost: Tensor | None, episode_length: float | Tensor | None, frames: int
-    ) -> None:
-        if episode_cost is None:
-            raise ValueError(f"{self.method} needs episode_cost, got None.")
-        if episode_cost.ndim != 2 or episode_cost.shape[-1] != 1:
-            raise ValueError(
-                f"episode_cost must have shape (E, 1), got {tuple(episode_cost.shape)}."
-            )
-        if not episode_cost.isfinite().all():
-            raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
-        if not len(episode_cost):
-            return
-        length = frames / len(episode_cost)
-        if episode_length is not None:
-            length = torch.as_tensor(episode_length, dtype=torch.float64).mean().item()
-        if not 0 < length < math.inf:
-            raise ValueError(f"episode_length must be positive and finite, got {episode_length}.")
-        self.mean_episode_cost = episode_cost.double().mean().item()
-        self.mean_episode_length = length
+        loss = self.loss_module
+        scale = 1 - float(loss.cost_value_estimator.gamma)
+        if self.episode_length is not None:
+            scale = 1 / self.episode_length
+        if not scale > 0:
+            raise ValueError("episode_length must be given if gamma of the costs is 1, got None.")
+        return scale * loss.cost_violation.item()
 
     def _local_problem(self, tensordict: TensorDictBase) -> TrustRegionProblem:
         parameters = actor_parameters(self.loss_module)
         gradient = -self._checked_gradient(self._surrogate_loss(tensordict), "reward")
         cost_gradient = torch.zeros_like(gradient)
-        if self.method.cost_limit is not None:
+        if self.method.constrained:
             cost_gradient = self._checked_gradient(self._cost_surrogate(tensordict), "cost")
         distribution = actor_distribution(self.loss_module, tensordict)
         with torch.no_grad():
@@ -254,7 +225,8 @@ class TrustRegionStep:
             self.max_kl,
             cost_gradient,
             natural_cost_gradient,
-            self.violation,
+            self._violation(),
+            product,
         )
 
     @torch.no_grad()
@@ -269,7 +241,7 @@ class TrustRegionStep:
         parameters = actor_parameters(self.loss_module)
         before = read_flat(parameters)
         fixed = actor_distribution(self.loss_module, tensordict)
-        limited = self.method.cost_limit is not None
+        limited = self.method.constrained
         old_loss = self._surrogate_loss(tensordict)
         old_cost = self._cost_surrogate(tensordict) if limited else torch.zeros_like(old_loss)
         asks_gain = not solution.recovery and bool(problem.gradient @ solution.step > 0)
@@ -335,8 +307,7 @@ class TrustRegionStep:
 
 
 _NUMBERS = ("kl", "surrogate_gain", "cost_surrogate_change", "step_fraction", "constraint_active")
-_COUNTS = ("rejected_steps", "indefinite_steps", "recovery_steps", "waiting_steps")
-_STATE = (*_COUNTS, "mean_episode_cost", "mean_episode_length")
+_COUNTS = ("rejected_steps", "indefinite_steps", "recovery_steps")
 
 
 def _check_loss(loss: PPOLoss, method: TrustRegionMethod) -> None:
@@ -348,7 +319,7 @@ def _check_loss(loss: PPOLoss, method: TrustRegionMethod) -> None:
         raise ValueError(f"loss_module must have reduction='mean', got {loss.reduction!r}.")
     if not actor_parameters(loss):
         raise ValueError("The actor of loss_module has no trainable parameter.")
-    if method.cost_limit is None:
+    if not method.constrained:
         return
     if not isinstance(loss, TrustRegionLoss):
         raise ValueError(

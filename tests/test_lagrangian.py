@@ -1,0 +1,319 @@
+"""LagrangianLoss: the wrapped loss at multiplier zero, PPOLagrangianLoss around ClipPPOLoss."""
+
+import copy
+from functools import partial
+
+import pytest
+import torch
+from networks import make_batch, make_critic, make_loss, make_networks
+from tensordict.utils import unravel_key
+from torch.distributions.transforms import SoftplusTransform
+from torchrl.modules import PopArtValueNorm
+from torchrl.objectives import (
+    A2CLoss,
+    ClipPPOLoss,
+    KLPENPPOLoss,
+    PPOLoss,
+    ReinforceLoss,
+    SACLoss,
+    SoftUpdate,
+)
+
+from torchrl_safe.objectives import DualAscent, LagrangianLoss, PIDControl, penalized_advantage
+
+PARENTS = {
+    "a2c": A2CLoss,
+    "reinforce": ReinforceLoss,
+    "ppo": PPOLoss,
+    "clip-ppo": ClipPPOLoss,
+    "kl-ppo": KLPENPPOLoss,
+    "a2c-options": partial(A2CLoss, clip_value=0.1, loss_critic_type="l2", entropy_coeff=0.3),
+    "clip-ppo-options": partial(ClipPPOLoss, clip_value=0.1, reduction="sum", clip_epsilon=0.1),
+    "not-functional": partial(ClipPPOLoss, functional=False),
+    "a2c-not-functional": partial(A2CLoss, functional=False),
+    "reinforce-not-functional": partial(ReinforceLoss, functional=False),
+}
+every_parent = pytest.mark.parametrize("parent", PARENTS.values(), ids=PARENTS.keys())
+
+
+def wrap(parent, num_costs=1, seed=0, **kwargs):
+    actor, critic, cost_critic = make_networks(num_costs, seed=seed)
+    return LagrangianLoss(parent(actor, critic), cost_critic, num_costs=num_costs, **kwargs)
+
+
+def bare(parent, seed=0):
+    actor, critic, _ = make_networks(seed=seed)
+    return parent(actor, critic)
+
+
+def assert_same_outputs(actual, expected):
+    for key, value in expected.items():
+        assert torch.equal(actual[key], value), key
+
+
+def total(losses):
+    return sum(value for key, value in losses.items() if key.startswith("loss_"))
+
+
+def adam_updates(loss, data, count):
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    order = torch.Generator().manual_seed(3)
+    for _ in range(count):
+        losses = loss(data[torch.randperm(len(data), generator=order)[:8]])
+        total(losses).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+
+# ---------------------------------------------------------------- multiplier zero
+
+
+@every_parent
+@pytest.mark.parametrize("num_costs", [1, 3])
+@pytest.mark.parametrize("precomputed", [True, False], ids=["advantages-given", "no-advantages"])
+def test_multiplier_zero_is_the_wrapped_loss_bit_for_bit(parent, precomputed, num_costs):
+    loss, expected_loss = wrap(parent, num_costs), bare(parent)
+    batch = make_batch(num_costs)
+    if precomputed:
+        batch = loss.estimate_advantages(batch).reshape(-1)
+    losses, expected = loss(batch.clone()), expected_loss(batch.clone())
+    assert_same_outputs(losses, expected)
+    extra = {"loss_cost_critic", "cost_explained_variance"}
+    extra |= {f"lagrange_multiplier_{index}" for index in range(num_costs)}
+    extra |= {"cost_value_clip_fraction"} if loss.clip_value else set()
+    assert set(losses.keys()) == set(expected.keys()) | extra
+
+
+@every_parent
+def test_multiplier_zero_trains_like_the_wrapped_loss_bit_for_bit(parent):
+    loss, expected_loss = wrap(parent, 2), bare(parent)
+    start = [parameter.detach().clone() for parameter in expected_loss.parameters()]
+    data = make_loss(2).estimate_advantages(make_batch(2)).reshape(-1)
+    for trained in (loss, expected_loss):
+        adam_updates(trained, data, 10)
+    expected = list(expected_loss.parameters())
+    assert all(map(torch.equal, loss.loss_module.parameters(), expected))
+    assert not any(map(torch.equal, start, expected))
+
+
+# ---------------------------------------------------------------- any multiplier
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"clip_value": 0.1}, {"reduction": "none"}, {"functional": False}, {"entropy_coeff": 0.3}],
+    ids=str,
+)
+@pytest.mark.parametrize("precomputed", [True, False], ids=["advantages-given", "no-advantages"])
+def test_ppo_lagrangian_is_the_wrapped_clip_ppo_bit_for_bit(precomputed, options):
+    multiplier = torch.tensor([0.5, 0.0, 2.0])
+    ours = wrap(partial(ClipPPOLoss, **options), 3, multiplier_init=multiplier)
+    theirs = make_loss(3, multiplier_init=multiplier, **options)
+    data, batch = ours.estimate_advantages(make_batch(3)), theirs.estimate_advantages(make_batch(3))
+    assert set(data.keys(True)) == set(batch.keys(True))
+    assert (data == batch).all()
+    data = data.reshape(-1) if precomputed else make_batch(3)
+    outputs, expected = ours(data), theirs(data)
+    assert set(outputs.keys()) == set(expected.keys())
+    assert_same_outputs(outputs, expected)
+    if "reduction" not in options:
+        adam_updates(ours, batch.reshape(-1), 10)
+        adam_updates(theirs, batch.reshape(-1), 10)
+        assert_same_outputs(ours(data), theirs(data))
+        assert not torch.equal(ours(data)["loss_objective"], expected["loss_objective"])
+
+
+@every_parent
+def test_the_wrapped_loss_sees_the_penalized_advantage(parent):
+    multiplier = torch.tensor([0.5, 0.0, 2.0])
+    loss = wrap(parent, 3, multiplier_init=multiplier)
+    data = loss.estimate_advantages(make_batch(3)).reshape(-1)
+    losses = loss(data)
+    data["advantage"] = penalized_advantage(data["advantage"], data["cost_advantage"], multiplier)
+    assert_same_outputs(losses, bare(parent)(data))
+
+
+RULES = {
+    "dual-ascent": partial(DualAscent, lr=1.0),
+    "softplus-adam": partial(
+        DualAscent, lr=0.1, optimizer=torch.optim.Adam, parametrization=SoftplusTransform()
+    ),
+    "pid": partial(PIDControl, kp=1.0, ki=1.0, kd=1.0),
+}
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=RULES.keys())
+def test_every_rule_moves_the_multiplier(rule):
+    loss = wrap(A2CLoss, 2, multiplier_init=0.5)
+    before = loss(make_batch(2))
+    rule(loss, cost_limit=torch.tensor([1.0, 2.0])).step(torch.tensor([[3.0, 1.0]]))
+    assert loss.lagrange_multiplier[0] > 0.5 > loss.lagrange_multiplier[1]
+    assert not torch.equal(loss(make_batch(2))["loss_objective"], before["loss_objective"])
+
+
+# ---------------------------------------------------------------- gradients, keys, state
+
+
+@every_parent
+def test_each_network_is_trained_by_its_own_loss(parent):
+    loss = wrap(parent, 2, multiplier_init=0.7)
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    loss(data)["loss_cost_critic"].sum().backward()
+    reached = {name for name, p in loss.named_parameters() if p.grad is not None and p.grad.any()}
+    assert reached
+    assert all(name.startswith("cost_critic_network") for name in reached)
+
+
+def test_the_wrapper_writes_nothing_into_its_input():
+    for parent in (A2CLoss, ReinforceLoss, ClipPPOLoss, KLPENPPOLoss):
+        loss, batch = wrap(parent, 2, multiplier_init=1.0), make_batch(2)
+        before = batch.clone()
+        loss(batch)
+        assert set(batch.keys(True)) == set(before.keys(True))
+        assert (batch == before).all()
+
+
+@pytest.mark.parametrize("parent", [A2CLoss, ReinforceLoss, ClipPPOLoss])
+def test_all_keys_can_be_nested(parent):
+    values = {"value": ("estimates", "v"), "cost_value": ("estimates", "c")}
+    actor, critic, cost_critic = make_networks(
+        2, value=values["value"], cost_value=values["cost_value"]
+    )
+    loss = LagrangianLoss(parent(actor, critic), cost_critic, num_costs=2, multiplier_init=0.7)
+    keys = {
+        **values,
+        "advantage": ("estimates", "a"),
+        "cost_advantage": ("estimates", "ca"),
+        "value_target": ("estimates", "t"),
+        "cost_value_target": ("estimates", "ct"),
+        "reward": ("info", "reward"),
+        "cost": ("info", "cost"),
+    }
+    loss.set_keys(**keys)
+    assert ("next", "info", "cost") in loss.in_keys
+    assert ("next", "info", "reward") in loss.in_keys
+    batch = make_batch(2)
+    for key in ("reward", "cost"):
+        batch["next"].rename_key_(key, ("info", key))
+    data = loss.estimate_advantages(batch).reshape(-1)
+    assert {("estimates", "a"), ("estimates", "ca"), ("estimates", "ct")} <= set(data.keys(True))
+    expected = wrap(parent, 2, multiplier_init=0.7)
+    assert_same_outputs(
+        loss(data), expected(expected.estimate_advantages(make_batch(2)).reshape(-1))
+    )
+    loss.set_keys(cost_advantage=None, advantage=None)
+    assert loss.tensor_keys.cost_advantage == "cost_advantage"
+    assert loss.loss_module.tensor_keys.advantage == "advantage"
+
+
+def test_an_unknown_key_is_refused():
+    with pytest.raises(ValueError, match="cost_limit is not an accepted"):
+        wrap(A2CLoss).set_keys(cost_limit="anything")
+
+
+@pytest.mark.parametrize("parent", [A2CLoss, ReinforceLoss, ClipPPOLoss])
+def test_call_with_keywords_equals_call_with_tensordict(parent):
+    loss, batch = wrap(parent, 2, multiplier_init=0.7), make_batch(2)
+    expected = loss(batch)
+    keys = {"_".join(k) if isinstance(k, tuple) else k: k for k in map(unravel_key, loss.in_keys)}
+    outputs = loss(**{name: batch[key] for name, key in keys.items()})
+    assert {"loss_cost_critic", "lagrange_multiplier_1"} <= set(loss.out_keys)
+    for key, output in zip(loss.out_keys, outputs, strict=True):
+        torch.testing.assert_close(output, expected[key])
+
+
+@every_parent
+@pytest.mark.parametrize("used", ["saved", "loaded"])
+def test_state_goes_between_a_fresh_and_a_used_loss(parent, used):
+    saved, loaded = wrap(parent, 2, multiplier_init=1.5), wrap(parent, 2, seed=5)
+    saved.make_value_estimator(gamma=0.5, lmbda=0.9).make_cost_value_estimator(gamma=0.7)
+    batch = make_batch(2)
+    {"saved": saved, "loaded": loaded}[used](batch)
+    assert loaded.load_state_dict(saved.state_dict(), strict=True)
+    assert loaded.lagrange_multiplier.tolist() == [1.5, 1.5]
+    assert_same_outputs(loaded(batch), saved(batch))
+    assert_same_outputs(copy.deepcopy(saved)(batch), saved(batch))
+
+
+def test_cast_and_reset():
+    loss = wrap(ClipPPOLoss, 2, multiplier_init=0.7).to(torch.float64)
+    batch = make_batch(2).apply(lambda x: x.double() if x.is_floating_point() else x)
+    assert loss(batch)["loss_objective"].dtype == torch.float64
+    for parameter in loss.parameters():
+        parameter.data.add_(1000.0)
+    loss.reset_parameters_recursive()
+    assert all((parameter.abs() < 10).all() for parameter in loss.parameters())
+
+
+def test_a_delayed_policy_is_updated_in_the_wrapped_loss():
+    options = {"delay_actor": True}
+    loss, expected = wrap(partial(ClipPPOLoss, **options), 2), bare(partial(ClipPPOLoss, **options))
+    data = make_loss(2).estimate_advantages(make_batch(2)).reshape(-1)
+    for target in (loss.loss_module, expected):
+        updater = SoftUpdate(target, eps=0.5)
+        adam_updates(target, data, 3)
+        updater.step()
+    assert_same_outputs(loss(data), expected(data))
+
+
+# tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.parametrize("parent", [A2CLoss, ReinforceLoss, ClipPPOLoss])
+def test_compiles_to_one_graph_that_sees_the_multiplier_move(parent):
+    graphs = []
+
+    def eager(graph, inputs):
+        graphs.append(graph)
+        return graph.forward
+
+    torch._dynamo.reset()
+    loss = wrap(parent, 2, multiplier_init=0.5)
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    compiled = torch.compile(loss, fullgraph=True, backend=eager)
+    compiled(data)
+    loss.lagrange_multiplier.fill_(2.5)
+    second, expected = compiled(data), loss(data)
+    for key, value in expected.items():
+        torch.testing.assert_close(second[key], value)
+    assert second["lagrange_multiplier_1"].item() == 2.5
+    assert len(graphs) == 1
+
+
+# ---------------------------------------------------------------- what does not fit
+
+
+def test_what_is_no_advantage_loss_is_refused():
+    actor, _, cost_critic = make_networks()
+    with pytest.raises(ValueError, match=r"loss_module must be a LossModule, got .*Linear"):
+        LagrangianLoss(torch.nn.Linear(1, 1), cost_critic)
+    sac = SACLoss(actor, make_critic("state_action_value"))
+    with pytest.raises(ValueError, match=r"reads an advantage, got SACLoss"):
+        LagrangianLoss(sac, cost_critic)
+
+
+@pytest.mark.parametrize(
+    ("parent", "argument"),
+    [
+        (partial(ClipPPOLoss, normalize_advantage=True), "normalize_advantage=True"),
+        (partial(ClipPPOLoss, advantage_norm=PopArtValueNorm(shape=1)), "advantage_norm"),
+        (partial(A2CLoss, advantage_norm=PopArtValueNorm(shape=1)), "advantage_norm"),
+    ],
+    ids=["normalize_advantage", "ppo-advantage_norm", "a2c-advantage_norm"],
+)
+def test_a_loss_that_would_normalize_the_mixture_is_refused(parent, argument):
+    with pytest.raises(ValueError, match=argument):
+        wrap(parent)
+
+
+def test_costs_that_do_not_fit_are_refused():
+    actor, critic, cost_critic = make_networks(3)
+    with pytest.raises(ValueError, match="num_costs must be at least 1, got 0"):
+        LagrangianLoss(A2CLoss(actor, critic), cost_critic, num_costs=0)
+    with pytest.raises(ValueError, match=r"multiplier_init.* 2 costs.*\(3,\)"):
+        wrap(A2CLoss, 2, multiplier_init=torch.ones(3))
+    loss = LagrangianLoss(A2CLoss(actor, critic), cost_critic, num_costs=2)
+    with pytest.raises(ValueError, match=r"\(24, 3\) and lagrange_multiplier of shape \(2,\)"):
+        loss(loss.estimate_advantages(make_batch(3)).reshape(-1))
+    for call in (loss, loss.estimate_advantages):
+        with pytest.raises(KeyError, match=r"\('next', 'cost'\)"):
+            call(make_batch(3).exclude(("next", "cost")))

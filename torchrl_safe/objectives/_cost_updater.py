@@ -1,0 +1,88 @@
+"""The front door for the cost of the episodes, shared by all updaters."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+
+class CostUpdater(abc.ABC):
+    """Checks episode costs, and lets :meth:`_move` write one buffer of a loss in place.
+
+    Args:
+        loss_module (LossModule): a loss with the buffer named ``_buffer``, of shape ``(k,)``.
+
+    Keyword Args:
+        cost_limit (float or Tensor): limit of each expected episode cost, one number or k.
+    """
+
+    _buffer: str
+
+    def __init__(self, loss_module: LossModule, *, cost_limit: float | Tensor) -> None:
+        if not isinstance(loss_module, LossModule):
+            raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
+        buffer = dict(loss_module.named_buffers(recurse=False)).get(self._buffer)
+        if buffer is None:
+            raise ValueError(f"{type(loss_module).__name__} has no {self._buffer} buffer.")
+        limit = torch.as_tensor(cost_limit, dtype=buffer.dtype)
+        if limit.shape not in ((), buffer.shape):
+            raise ValueError(
+                f"cost_limit must be one number or one for each of the {len(buffer)} costs, "
+                f"got shape {tuple(limit.shape)}."
+            )
+        if not limit.isfinite().all():
+            raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
+        self.loss_module = loss_module
+        self.cost_limit = limit.expand_as(buffer).clone()
+
+    @torch.no_grad()
+    def step(self, episode_cost: Tensor) -> None:
+        """Moves the buffer of the loss once.
+
+        Args:
+            episode_cost (Tensor): undiscounted cost of each episode that ended in the batch,
+                shape ``(E, k)``. With ``E = 0`` nothing changes.
+
+        Raises:
+            ValueError: if the shape is wrong or a cost is NaN or infinite; nothing has changed
+                then.
+
+        With :class:`~torchrl.envs.RewardSum` a collector's batch gives it as
+        ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``.
+        """
+        buffer = getattr(self.loss_module, self._buffer)
+        if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:
+            raise ValueError(
+                f"episode_cost must have shape (E, {len(buffer)}), got {tuple(episode_cost.shape)}."
+            )
+        if not episode_cost.isfinite().all():
+            raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
+        if not len(episode_cost):
+            return
+        mean_cost = episode_cost.to(buffer).mean(0)
+        self._move(buffer, mean_cost - self.cost_limit.to(buffer))
+
+    @abc.abstractmethod
+    def _move(self, buffer: Tensor, violation: Tensor) -> None:
+        """Writes the buffer in place; ``violation`` is mean episode cost minus limit, ``(k,)``."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the state of the updater; the buffer is in the state of the loss."""
+        return {"cost_limit": self.cost_limit.clone()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Loads a state that :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if the state is of another number of costs.
+        """
+        if state_dict["cost_limit"].shape != self.cost_limit.shape:
+            raise ValueError(
+                f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "
+                f"{len(self.cost_limit)}."
+            )
+        self.cost_limit = state_dict["cost_limit"].clone()

@@ -1,0 +1,90 @@
+"""The clipped surrogate of the costs, for losses that penalize it."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_safe.objectives.violation import ViolationMixin
+
+
+def clipped_cost_surrogate(
+    log_weight: Tensor,
+    cost_advantage: Tensor,
+    bounds: tuple[Tensor, Tensor],
+    log_is_weight: Tensor | float = 0.0,
+) -> Tensor:
+    r"""PPO's surrogate with the sign of a cost: the larger of the two products counts.
+
+    .. math::
+        \max(r A_c,\ \mathrm{clip}(r) A_c)
+
+    Args:
+        log_weight (Tensor): logarithm of the ratio r that is clipped, shape ``(*B, 1)``.
+        cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
+        bounds (tuple of Tensor): logarithms of the smallest and the largest clipped ratio.
+        log_is_weight (Tensor or float, optional): logarithm of what both products are weighted
+            by, shape ``(*B, 1)``. Defaults to ``0.0``.
+
+    Returns:
+        The surrogate of each sample and cost, shape ``(*B, k)``.
+    """
+    ratio = (log_weight + log_is_weight).exp()
+    clipped = (log_weight.clamp(*bounds) + log_is_weight).exp()
+    return torch.maximum(ratio * cost_advantage, clipped * cost_advantage)
+
+
+class CostSurrogateMixin(ViolationMixin):
+    """Adds ``loss_penalty``, a function of the mean cost surrogates, to ``ClipPPOLoss``."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if self.reduction != "mean":
+            raise ValueError(
+                "reduction must be 'mean', since the penalty is a function of the batch mean, got "
+                f"{self.reduction!r}."
+            )
+        self._log_ratios: Any = None
+
+    @abc.abstractmethod
+    def _penalty(self, surrogate: Tensor) -> Tensor:
+        """The penalty of each cost, shape ``(k,)``, from its mean surrogate, shape ``(k,)``."""
+
+    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
+        # Kept for the penalty, so that the policy is evaluated once.
+        evaluated = super()._log_weight(tensordict, adv_shape)
+        self._log_ratios = evaluated[0], evaluated[3]
+        return evaluated
+
+    def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
+        log_weight, log_is_weight = self._log_ratios
+        self._log_ratios = None
+        cost_advantage = tensordict.get(self.tensor_keys.cost_advantage)
+        if cost_advantage.shape[-1] != self.num_costs:
+            raise ValueError(
+                f"cost_advantage must have one column for each of the {self.num_costs} costs of "
+                f"num_costs, got shape {tuple(cost_advantage.shape)}."
+            )
+        surrogate = clipped_cost_surrogate(
+            log_weight,
+            cost_advantage,
+            self._clip_bounds,
+            0.0 if log_is_weight is None else log_is_weight,
+        )
+        means = [self._reduce_loss(column, tensordict) for column in surrogate.unbind(-1)]
+        losses.set("loss_penalty", self._penalty(torch.stack(means)).sum())
+        super()._set_cost_outputs(losses, tensordict)
+
+    def _cost_out_keys(self) -> list[NestedKey]:
+        return ["loss_penalty", *super()._cost_out_keys()]
+
+
+def check_positive(name: str, value: float) -> None:
+    """Refuses a coefficient that is not positive, by name."""
+    if not value > 0:
+        raise ValueError(f"{name} must be positive, got {value}.")

@@ -1,0 +1,186 @@
+"""First order constrained optimization in policy space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.distributions import kl_divergence
+from torchrl.objectives import PPOLoss
+
+from torchrl_safe.objectives._cost_critic import CostKeys
+from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
+from torchrl_safe.objectives._surrogate import check_positive
+from torchrl_safe.objectives.functional import penalized_advantage
+
+
+class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
+    r"""Projects the best policy of a trust region on the policies of the network.
+
+    Presented in "First Order Constrained Optimization in Policy Space", Zhang, Vuong, Ross 2020
+    (https://arxiv.org/abs/2002.06506), whose loss is the mean over the states of
+
+    .. math::
+        \left(D_{KL}(\pi_\theta \| \pi_{\theta_k}) - \frac{1}{\lambda} \,
+            r \, \Big(A_r - \sum_i \nu_i A_{c_i}\Big)\right)
+        \mathbb{1}\left[D_{KL}(\pi_\theta \| \pi_{\theta_k}) \le \delta\right]
+
+    Its two terms are reported apart, ``"loss_kl"`` and ``"loss_objective"``. The multipliers
+    :math:`\nu` are the ``lagrange_multiplier`` buffer, of shape ``(k,)``: a
+    :class:`~torchrl_safe.objectives.MultiplierUpdater` moves them, the paper's being
+    :class:`~torchrl_safe.objectives.DualAscent`. There is no division by :math:`1 + \sum_i \nu_i`,
+    as there is none in the paper (OmniSafe divides).
+
+    The divergence is that from the parameters of the distribution that the collector stored, as in
+    :class:`~torchrl.objectives.KLPENPPOLoss`; the distribution must be one for which
+    :func:`torch.distributions.kl_divergence` is known. The paper also stops the epochs of a batch
+    when the mean divergence exceeds :math:`\delta`: the output ``"kl"`` is for that.
+
+    Args:
+        actor_network (ProbabilisticTensorDictSequential): policy operator.
+        critic_network (TensorDictModule): value operator of the reward, writes
+            ``"state_value"`` of shape ``(*B, 1)``.
+        cost_critic_network (TensorDictModule): value operator of the costs, writes
+            ``"cost_value"`` of shape ``(*B, k)``.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs. Defaults to ``1``.
+        temperature (float, optional): the paper's :math:`\lambda`. Defaults to ``1.5``, as
+            there.
+        kl_bound (float, optional): the paper's :math:`\delta`: states that have moved further
+            are left out. Defaults to ``0.02``, as there.
+        multiplier_init (float or Tensor, optional): multiplier to start with, one number or k.
+            Defaults to ``0.0``.
+        cost_critic_coeff (float, optional): weight of the cost critic's loss.
+            Defaults to ``1.0``.
+        **kwargs: every keyword argument of :class:`~torchrl.objectives.PPOLoss`.
+
+    Raises:
+        ValueError: if ``num_costs``, ``temperature``, ``kl_bound`` or ``multiplier_init`` is not
+            usable; in a call, if the cost critic or the costs have another width than
+            ``num_costs``.
+        KeyError: in a call, if the batch has no parameters of the distribution.
+
+    Keys beside those of ``PPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
+    ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
+
+    Outputs beside those of ``PPOLoss``: ``loss_kl``, ``kl`` (mean over the states),
+    ``loss_cost_critic``, ``cost_explained_variance`` (mean over the costs),
+    ``lagrange_multiplier_0`` ... ``lagrange_multiplier_{k-1}``, and with ``clip_value`` also
+    ``cost_value_clip_fraction``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+        >>> from torchrl_safe.objectives import DualAscent
+        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     distribution_class=IndependentNormal,
+        ...     return_log_prob=True,
+        ... )
+        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
+        >>> cost_critic = ValueOperator(
+        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
+        ... )
+        >>> loss = FOCOPSLoss(actor, critic, cost_critic, num_costs=2)
+        >>> updater = DualAscent(loss, cost_limit=torch.tensor([1.0, 5.0]), lr=0.01)
+        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
+        >>> batch = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
+        >>> with torch.no_grad():
+        ...     batch = actor(batch)
+        >>> batch["next"] = TensorDict(
+        ...     observation=torch.randn(3, 5, 4),
+        ...     reward=torch.randn(3, 5, 1),
+        ...     cost=torch.rand(3, 5, 2),
+        ...     done=done,
+        ...     terminated=done,
+        ...     batch_size=[3, 5],
+        ... )
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
+        >>> losses = loss(loss.estimate_advantages(batch).reshape(-1))
+        >>> losses["lagrange_multiplier_0"], losses["kl"]
+        (tensor(0.0200), tensor(0.))
+    """
+
+    _schedulable_buffers = frozenset({"temperature", "kl_bound"})
+
+    temperature: Tensor
+    kl_bound: Tensor
+
+    @dataclass
+    class _AcceptedKeys(CostKeys, PPOLoss._AcceptedKeys):
+        pass
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        cost_critic_network: TensorDictModuleBase,
+        *,
+        num_costs: int = 1,
+        temperature: float = 1.5,
+        kl_bound: float = 0.02,
+        multiplier_init: float | Tensor = 0.0,
+        cost_critic_coeff: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            critic_network,
+            cost_critic_network=cost_critic_network,
+            num_costs=num_costs,
+            multiplier_init=multiplier_init,
+            cost_critic_coeff=cost_critic_coeff,
+            **kwargs,
+        )
+        check_positive("temperature", temperature)
+        check_positive("kl_bound", kl_bound)
+        device = self.cost_critic_coeff.device
+        self.register_coeff_buffer("temperature", temperature, device=device)
+        self.register_coeff_buffer("kl_bound", kl_bound, device=device)
+        self._kl: Any = None
+
+    def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:
+        multiplier = self.lagrange_multiplier
+        mixed = penalized_advantage(advantage, cost_advantage, multiplier, rescale=False)
+        return mixed / self.temperature
+
+    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
+        # Read before the policy is evaluated, which may write parameters of its own.
+        old = self.actor_network.build_dist_from_params(
+            tensordict.select(*self._distribution_keys())
+        )
+        log_weight, dist, *others = super()._log_weight(tensordict, adv_shape)
+        kl = kl_divergence(dist, old).unsqueeze(-1)
+        # Kept for the other term, so that the policy is evaluated once.
+        self._kl = kl
+        # A ratio of zero leaves a state out of the objective and of its gradient.
+        return log_weight.masked_fill(kl > self.kl_bound, -torch.inf), dist, *others
+
+    def _distribution_keys(self) -> list[NestedKey]:
+        return self.actor_network[-1].in_keys
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        self._in_keys += [key for key in self._distribution_keys() if key not in self._in_keys]
+
+    def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
+        kl, self._kl = self._kl, None
+        near = kl.masked_fill(kl > self.kl_bound, 0.0)
+        losses.set("loss_kl", self._reduce_loss(near, tensordict).squeeze(-1))
+        losses.set("kl", kl.detach().mean())
+        super()._set_cost_outputs(losses, tensordict)
+
+    def _cost_out_keys(self) -> list[NestedKey]:
+        return ["loss_kl", "kl", *super()._cost_out_keys()]

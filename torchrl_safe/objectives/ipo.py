@@ -1,0 +1,167 @@
+"""PPO with a logarithmic barrier before the limits of the costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives import ClipPPOLoss
+
+from torchrl_safe.objectives._cost_critic import CostKeys
+from torchrl_safe.objectives._surrogate import CostSurrogateMixin, check_positive
+
+
+def log_barrier(violation: Tensor, sharpness: Tensor) -> Tensor:
+    r"""Logarithmic barrier, continued by its tangent where the limit is reached.
+
+    .. math::
+        -\frac{1}{t} \log(-z) \quad \text{for} \quad z \le -\frac{1}{t^2}
+
+    (Liu et al. 2019, https://arxiv.org/abs/1910.09615), and beyond that the line of slope
+    t that continues it (Kervadec et al. 2019, https://arxiv.org/abs/1904.04205): a barrier has no
+    value, and so no way back, where its limit is exceeded.
+
+    Args:
+        violation (Tensor): cost minus limit z, any shape.
+        sharpness (Tensor): the parameter t; the larger, the closer to the limit it acts.
+
+    Returns:
+        The penalty, to be minimized, of the shape of ``violation``.
+
+    Examples:
+        >>> import torch
+        >>> log_barrier(torch.tensor([-1.0, -0.25, 1.0]), torch.tensor(2.0))
+        tensor([0.0000, 0.6931, 3.1931])
+    """
+    edge = -(sharpness**-2)
+    inside = torch.minimum(violation, edge)
+    return -(-inside).log() / sharpness + sharpness * (violation - inside)
+
+
+class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
+    r"""Clipped PPO loss with a logarithmic barrier before the limits of k expected costs.
+
+    Presented in "IPO: Interior-point Policy Optimization under Constraints", Liu, Ding, Liu 2019
+    (https://arxiv.org/abs/1910.09615). To the loss of PPO it adds
+
+    .. math::
+        -\frac{1}{t} \sum_i \log\left(d_i - J_{c_i}(\pi_\theta)\right)
+
+    as ``"loss_penalty"``: a force of :math:`1 / (t (d_i - J_{c_i}))` that grows without bound
+    before the limit, and no multiplier to learn. A
+    :class:`~torchrl_safe.objectives.ViolationUpdater` brings :math:`J_{c_i} - d_i` of the policy
+    that collected the batch, once for each of them; the cost of the policy that is being trained
+    is estimated from it with PPO's clipped surrogate,
+
+    .. math::
+        J_{c_i}(\pi_\theta) \approx J_{c_i} + \frac{1}{1 - \gamma}
+            \mathbb{E}[\max(r A_{c_i}, \mathrm{clip}(r) A_{c_i})],
+
+    :math:`\gamma` being the discount of the cost's value estimator. The paper presumes a policy
+    that starts within the limits; where one does not, the tangent of :func:`log_barrier` leads
+    back. A barrier keeps its distance: with one binding cost the policy settles where
+    :math:`t (d - J_c)` is the inverse of the optimal multiplier. OmniSafe's implementation puts
+    the barrier's force of the collecting policy in the place of a multiplier instead, and holds
+    it fixed while the policy moves.
+
+    Args:
+        actor_network (ProbabilisticTensorDictSequential): policy operator.
+        critic_network (TensorDictModule): value operator of the reward, writes
+            ``"state_value"`` of shape ``(*B, 1)``.
+        cost_critic_network (TensorDictModule): value operator of the costs, writes
+            ``"cost_value"`` of shape ``(*B, k)``.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs. Defaults to ``1``.
+        sharpness (float, optional): the paper's t. Defaults to ``20.0``, as there.
+        cost_critic_coeff (float, optional): weight of the cost critic's loss.
+            Defaults to ``1.0``.
+        **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
+
+    Raises:
+        ValueError: if ``num_costs`` or ``sharpness`` is not positive or ``reduction`` is not
+            ``"mean"``; in a call, if the cost critic or the costs have another width than
+            ``num_costs``.
+
+    Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
+    ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
+
+    Outputs beside those of ``ClipPPOLoss``: ``loss_penalty``, ``loss_cost_critic``,
+    ``cost_explained_variance`` (mean over the costs), ``cost_violation_0`` ...
+    ``cost_violation_{k-1}``, and with ``clip_value`` also ``cost_value_clip_fraction``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+        >>> from torchrl_safe.objectives import ViolationUpdater
+        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     distribution_class=IndependentNormal,
+        ...     return_log_prob=True,
+        ... )
+        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
+        >>> cost_critic = ValueOperator(
+        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
+        ... )
+        >>> loss = IPOLoss(actor, critic, cost_critic, num_costs=2)
+        >>> updater = ViolationUpdater(loss, cost_limit=torch.tensor([1.0, 5.0]))
+        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
+        >>> batch = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
+        >>> with torch.no_grad():
+        ...     batch = actor(batch)
+        >>> batch["next"] = TensorDict(
+        ...     observation=torch.randn(3, 5, 4),
+        ...     reward=torch.randn(3, 5, 1),
+        ...     cost=torch.rand(3, 5, 2),
+        ...     done=done,
+        ...     terminated=done,
+        ...     batch_size=[3, 5],
+        ... )
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
+        >>> losses = loss(loss.estimate_advantages(batch).reshape(-1))
+        >>> losses["cost_violation_1"], losses["loss_penalty"] > 0
+        (tensor(-4.5000), tensor(True))
+    """
+
+    _schedulable_buffers = frozenset({"sharpness"})
+
+    sharpness: Tensor
+
+    @dataclass
+    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
+        pass
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        cost_critic_network: TensorDictModuleBase,
+        *,
+        num_costs: int = 1,
+        sharpness: float = 20.0,
+        cost_critic_coeff: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            critic_network,
+            cost_critic_network=cost_critic_network,
+            num_costs=num_costs,
+            cost_critic_coeff=cost_critic_coeff,
+            **kwargs,
+        )
+        check_positive("sharpness", sharpness)
+        self.register_coeff_buffer("sharpness", sharpness, device=self.cost_critic_coeff.device)
+
+    def _penalty(self, surrogate: Tensor) -> Tensor:
+        rise = surrogate / (1 - self.cost_value_estimator.gamma)
+        return log_barrier(self.cost_violation + rise, self.sharpness)

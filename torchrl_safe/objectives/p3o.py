@@ -1,0 +1,159 @@
+"""PPO with an exact penalty on the costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives import ClipPPOLoss
+
+from torchrl_safe.objectives._cost_critic import CostKeys
+from torchrl_safe.objectives._surrogate import CostSurrogateMixin, check_positive
+
+
+def exact_penalty(
+    surrogate: Tensor, violation: Tensor, scale: Tensor | float, coeff: Tensor | float
+) -> Tensor:
+    r"""P3O's penalty: nothing below the limit, proportional to the violation above it.
+
+    .. math::
+        \kappa \max(0,\ L_{c_i} + s (J_{c_i} - d_i))
+
+    (Zhang et al. 2022, https://arxiv.org/abs/2205.11814, where :math:`s = 1 - \gamma`.)
+
+    Args:
+        surrogate (Tensor): mean surrogate :math:`L_{c_i}` of each cost, cost per step, shape
+            ``(k,)``.
+        violation (Tensor): mean episode cost minus limit, shape ``(k,)``.
+        scale (Tensor or float): steps per episode, inverted: the unit of a violation times this
+            is that of a surrogate.
+        coeff (Tensor or float): the factor :math:`\kappa`.
+
+    Returns:
+        The penalty of each cost, shape ``(k,)``.
+    """
+    return coeff * (surrogate + scale * violation).relu()
+
+
+class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
+    r"""Clipped PPO loss with an exact penalty on k expected costs.
+
+    Presented in "Penalized Proximal Policy Optimization for Safe Reinforcement Learning", Zhang
+    et al. 2022 (https://arxiv.org/abs/2205.11814). To the loss of PPO it adds
+
+    .. math::
+        \kappa \sum_i \max\left(0,\ \mathbb{E}[\max(r A_{c_i}, \mathrm{clip}(r) A_{c_i})]
+            + (1 - \gamma) (J_{c_i} - d_i)\right)
+
+    as ``"loss_penalty"``. There is no multiplier to learn: for a :math:`\kappa` larger than every
+    optimal multiplier the penalty is exact. A :class:`~torchrl_safe.objectives.ViolationUpdater`
+    brings the violations :math:`J_{c_i} - d_i`, once for each collected batch. While no limit
+    binds the penalty is zero, and the loss :class:`~torchrl.objectives.ClipPPOLoss`, bit for bit.
+
+    :math:`\gamma` is the discount of the cost's value estimator. The factor
+    :math:`1 - \gamma` turns the cost of an episode into the cost of a step, which is the unit of
+    the advantages. OmniSafe's implementation leaves out the factor and the clipping; here both are
+    as in the paper. For episodes of few steps T, a discount of about ``1 - 1 / T`` makes it fit.
+
+    Args:
+        actor_network (ProbabilisticTensorDictSequential): policy operator.
+        critic_network (TensorDictModule): value operator of the reward, writes
+            ``"state_value"`` of shape ``(*B, 1)``.
+        cost_critic_network (TensorDictModule): value operator of the costs, writes
+            ``"cost_value"`` of shape ``(*B, k)``.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs. Defaults to ``1``.
+        penalty_coeff (float, optional): the factor :math:`\kappa`, in units of standardized
+            reward advantage per cost advantage. Defaults to ``20.0``, as in the paper.
+        cost_critic_coeff (float, optional): weight of the cost critic's loss.
+            Defaults to ``1.0``.
+        **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
+
+    Raises:
+        ValueError: if ``num_costs`` or ``penalty_coeff`` is not positive or ``reduction`` is not
+            ``"mean"``; in a call, if the cost critic or the costs have another width than
+            ``num_costs``.
+
+    Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
+    ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
+
+    Outputs beside those of ``ClipPPOLoss``: ``loss_penalty``, ``loss_cost_critic``,
+    ``cost_explained_variance`` (mean over the costs), ``cost_violation_0`` ...
+    ``cost_violation_{k-1}``, and with ``clip_value`` also ``cost_value_clip_fraction``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+        >>> from torchrl_safe.objectives import ViolationUpdater
+        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     distribution_class=IndependentNormal,
+        ...     return_log_prob=True,
+        ... )
+        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
+        >>> cost_critic = ValueOperator(
+        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
+        ... )
+        >>> loss = P3OLoss(actor, critic, cost_critic, num_costs=2)
+        >>> updater = ViolationUpdater(loss, cost_limit=torch.tensor([1.0, 5.0]))
+        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
+        >>> batch = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
+        >>> with torch.no_grad():
+        ...     batch = actor(batch)
+        >>> batch["next"] = TensorDict(
+        ...     observation=torch.randn(3, 5, 4),
+        ...     reward=torch.randn(3, 5, 1),
+        ...     cost=torch.rand(3, 5, 2),
+        ...     done=done,
+        ...     terminated=done,
+        ...     batch_size=[3, 5],
+        ... )
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
+        >>> losses = loss(loss.estimate_advantages(batch).reshape(-1))
+        >>> losses["cost_violation_0"], losses["loss_penalty"] > 0
+        (tensor(2.), tensor(True))
+    """
+
+    _schedulable_buffers = frozenset({"penalty_coeff"})
+
+    penalty_coeff: Tensor
+
+    @dataclass
+    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
+        pass
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        cost_critic_network: TensorDictModuleBase,
+        *,
+        num_costs: int = 1,
+        penalty_coeff: float = 20.0,
+        cost_critic_coeff: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            critic_network,
+            cost_critic_network=cost_critic_network,
+            num_costs=num_costs,
+            cost_critic_coeff=cost_critic_coeff,
+            **kwargs,
+        )
+        check_positive("penalty_coeff", penalty_coeff)
+        device = self.cost_critic_coeff.device
+        self.register_coeff_buffer("penalty_coeff", penalty_coeff, device=device)
+
+    def _penalty(self, surrogate: Tensor) -> Tensor:
+        scale = 1 - self.cost_value_estimator.gamma
+        return exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)

@@ -1,0 +1,71 @@
+"""How far the costs are from their limits, for the losses that read it themselves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_safe.objectives._cost_critic import CostCriticMixin
+from torchrl_safe.objectives._cost_updater import CostUpdater
+
+
+class ViolationUpdater(CostUpdater):
+    """Tells a loss how far the batch's mean episode costs are from their limits.
+
+    It writes the ``cost_violation`` buffer that :class:`~torchrl_safe.objectives.P3OLoss`,
+    :class:`~torchrl_safe.objectives.IPOLoss` and :class:`~torchrl_safe.objectives.CRPOLoss`
+    read, once for each collected batch and before the batch is learned from. Until the first
+    episode has ended the buffer is zero: as if every cost stood at its limit.
+
+    Args:
+        loss_module (LossModule): a loss with a ``cost_violation`` buffer of shape ``(k,)``.
+
+    Keyword Args:
+        cost_limit (float or Tensor): limit of each expected episode cost, one number or k, in
+            the unit of the undiscounted episode cost.
+
+    Raises:
+        ValueError: if the loss has no such buffer, or a limit is not usable.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.objectives import LossModule
+        >>> loss = LossModule()
+        >>> loss.register_buffer("cost_violation", torch.zeros(2))
+        >>> updater = ViolationUpdater(loss, cost_limit=torch.tensor([1.0, 5.0]))
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
+        >>> loss.cost_violation
+        tensor([ 2.0000, -4.5000])
+    """
+
+    _buffer = "cost_violation"
+
+    def _move(self, buffer: Tensor, violation: Tensor) -> None:
+        buffer.copy_(violation)
+
+
+class ViolationMixin(CostCriticMixin):
+    """Adds the buffer that :class:`ViolationUpdater` writes, and reports it."""
+
+    cost_violation: Tensor
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        violation = torch.zeros(self.num_costs, device=self.cost_critic_coeff.device)
+        self.register_buffer("cost_violation", violation)
+
+    def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
+        super()._set_cost_outputs(losses, tensordict)
+        # Scalars and clones, as of the multipliers.
+        for index, violation in enumerate(self.cost_violation.clone().unbind()):
+            losses.set(f"cost_violation_{index}", violation)
+
+    def _cost_out_keys(self) -> list[NestedKey]:
+        return [
+            *super()._cost_out_keys(),
+            *(f"cost_violation_{index}" for index in range(self.num_costs)),
+        ]
