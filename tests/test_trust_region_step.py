@@ -14,6 +14,7 @@ from tensordict.nn import (
 )
 from torch import nn
 from torch.distributions import Categorical, kl_divergence
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
     IndependentNormal,
     OneHotCategorical,
@@ -79,16 +80,20 @@ def make_loss(num_costs=1, actor="normal", seed=0, **kwargs):
     return TrustRegionLoss(*networks, num_costs=num_costs, **{"entropy_bonus": False, **kwargs})
 
 
+def act(loss, data):
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        return loss.actor_network(data)
+
+
 def make_data(loss, seed=1):
-    """A batch by the present actor; advantages that depend on what it did."""
+    """A batch by the present actor; what pays, costs too."""
     torch.manual_seed(seed)
-    data = TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH])
-    with torch.no_grad():
-        data = loss.actor_network(data)
+    data = act(loss, TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH]))
     action = data["action"].float().reshape(BATCH, -1)
-    advantage = (action @ torch.randn(action.shape[-1], 1)) + 0.3 * torch.randn(BATCH, 1)
+    slope = torch.randn(action.shape[-1], 1)
+    advantage = action @ slope + 0.3 * torch.randn(BATCH, 1)
     data["advantage"] = (advantage - advantage.mean()) / advantage.std()
-    cost = action @ torch.randn(action.shape[-1], 3) + 0.3 * torch.randn(BATCH, 3)
+    cost = action @ (slope + 0.5 * torch.randn(action.shape[-1], 3)) + 0.3 * torch.randn(BATCH, 3)
     data["cost_advantage"] = (cost - cost.mean(0))[:, : getattr(loss, "num_costs", 1)]
     data["value_target"] = torch.randn(BATCH, 1)
     data["cost_value_target"] = torch.randn_like(data["cost_advantage"])
@@ -112,7 +117,7 @@ def distribution(loss, data):
 # ---------------------------------------------------------------- what a step keeps
 
 
-@pytest.mark.parametrize("violation", [-100.0, -0.5, 0.0, 0.5, 100.0])
+@pytest.mark.parametrize("violation", [-100.0, -0.2, 0.2, 100.0])
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
 @pytest.mark.parametrize("actor", ACTORS)
 def test_a_step_keeps_divergence_and_cost_within_bounds(actor, method, violation):
@@ -157,8 +162,7 @@ def test_the_step_is_the_natural_gradient():
     torch.manual_seed(0)
     loss = PPOLoss(actor.double(), make_critic().double(), entropy_bonus=False)
     data = TensorDict(observation=torch.randn(BATCH, OBSERVATION).double(), batch_size=[BATCH])
-    with torch.no_grad():
-        data = actor(data)
+    data = act(loss, data)
     data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1).double()
     before = actor_state(loss)
     info = TrustRegionStep(loss, max_kl=1e-6, damping=0.0, cg_iterations=20).step(data)
@@ -222,7 +226,7 @@ def test_a_very_large_multiplier_lowers_its_cost_only():
     data = make_data(loss)
     before = loss.cost_surrogate_loss(data)
     TrustRegionStep(loss, max_kl=MAX_KL).step(data)
-    assert (loss.cost_surrogate_loss(data) - before)[1] < -0.05
+    assert (loss.cost_surrogate_loss(data) - before)[1] < -0.01
 
     alone = make_loss(3)
     data["advantage"] = -data["cost_advantage"][:, 1:2]
@@ -261,7 +265,7 @@ def test_the_violation_is_divided_by_the_length_of_an_episode():
     assert not torch.equal(stepped(0.02, episode_length=1), expected)
     torch.testing.assert_close(stepped(10.0, episode_length=1000), expected)
     torch.testing.assert_close(stepped(0.5, gamma=0.98), expected)
-    with pytest.raises(ValueError, match="episode_length must be given if gamma .* is 1"):
+    with pytest.raises(ValueError, match=r"episode_length must be given if gamma .* is 1"):
         stepped(0.5, gamma=1.0)
 
 
@@ -299,8 +303,7 @@ def test_a_composite_action():
         torch.manual_seed(0)
         loss = PPOLoss(actor, make_critic(), entropy_bonus=False)
         data = TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH])
-        with torch.no_grad():
-            data = actor(data)
+        data = act(loss, data)
         data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1)
         old = distribution(loss, data)
         info = TrustRegionStep(loss, max_kl=MAX_KL).step(data)
@@ -339,8 +342,7 @@ def test_nested_keys():
         if nest:
             batch.rename_key_("observation", name("observation"))
             batch.rename_key_("action", name("action"))
-            for log_prob in (loss.tensor_keys.sample_log_prob,):
-                batch.rename_key_("action_log_prob", log_prob)
+            batch.rename_key_("action_log_prob", loss.tensor_keys.sample_log_prob)
             batch["next"].rename_key_("observation", name("observation"))
             batch["next"].rename_key_("cost", name("cost"))
         data = loss.estimate_advantages(batch).reshape(-1)
@@ -432,21 +434,40 @@ def test_a_line_search_that_fails_leaves_the_actor_bit_for_bit():
 
 
 def test_a_step_that_does_not_gain_what_it_promised_is_refused():
-    """Up the gradient, but far over the top: to first order a gain, in truth a loss."""
+    """All actions are good: to first order a little is gained, far away they are all gone."""
     loss = make_loss()
     data = make_data(loss)
-    data["advantage"] = -data["action"].pow(2).sum(-1, keepdim=True)
-    step = TrustRegionStep(loss, Fixed(20.0), max_kl=1e6, max_backtracks=0)
+    data["advantage"].fill_(1.0)
+    step = TrustRegionStep(loss, Fixed(100.0), max_kl=1e6, max_backtracks=0)
     before = actor_state(loss)
     step.step(data)
     assert step.rejected_steps == 1
     assert torch.equal(actor_state(loss), before)
 
 
-def test_a_candidate_that_cannot_be_evaluated_leaves_the_actor_bit_for_bit():
-    loss = make_loss()
+@pytest.mark.parametrize("actor", ACTORS)
+def test_a_step_without_end_is_refused(actor):
+    loss = make_loss(actor=actor)
     before = actor_state(loss)
-    with pytest.raises(ValueError, match="loc|scale"):
+    step = TrustRegionStep(loss, Fixed(float("inf")))
+    step.step(make_data(loss))
+    assert step.rejected_steps == 1
+    assert torch.equal(actor_state(loss), before)
+
+
+class Guard(nn.Module):
+    def forward(self, logits):
+        if not logits.isfinite().all():
+            raise RuntimeError("logits are not finite")
+        return logits
+
+
+def test_an_actor_that_raises_in_the_line_search_is_left_bit_for_bit():
+    actor = discrete_actor(Categorical)
+    actor.module[0].module.append(Guard())
+    loss = PPOLoss(actor, make_critic(), entropy_bonus=False)
+    before = actor_state(loss)
+    with pytest.raises(RuntimeError, match="logits are not finite"):
         TrustRegionStep(loss, Fixed(float("inf"))).step(make_data(loss))
     assert torch.equal(actor_state(loss), before)
 
@@ -454,10 +475,9 @@ def test_a_candidate_that_cannot_be_evaluated_leaves_the_actor_bit_for_bit():
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
 def test_an_indefinite_fisher_matrix_leaves_the_actor_bit_for_bit(method):
     loss = make_loss()
-    # A sharp negative bend of the observation's scale: no policy has it, a broken one may.
     data = make_data(loss)
     step = TrustRegionStep(loss, method)
-    step.damping = -1e3
+    step.damping = -1e3  # No policy has a negative bend of its own, but for rounding.
     before = actor_state(loss)
     info = step.step(data)
     assert torch.equal(actor_state(loss), before)
@@ -471,7 +491,7 @@ def test_a_gradient_that_is_not_finite_is_refused(name):
     data = make_data(loss)
     data["advantage" if name == "reward" else "cost_advantage"][3] = float("nan")
     before = actor_state(loss)
-    with pytest.raises(ValueError, match="gradient of the (reward|cost) surrogate.*nan"):
+    with pytest.raises(ValueError, match=r"gradient of the (reward|cost) surrogate.*nan"):
         TrustRegionStep(loss, CPO()).step(data)
     assert torch.equal(actor_state(loss), before)
 
@@ -512,22 +532,22 @@ def test_a_missing_advantage_is_named(key):
 
 @pytest.mark.parametrize("method", [CPO(), PCPO()], ids=["cpo", "pcpo"])
 def test_one_cost_and_a_cost_critic_are_asked_for(method):
-    with pytest.raises(ValueError, match="limits one cost.*has 3"):
+    with pytest.raises(ValueError, match=r"limits one cost.*has 3"):
         TrustRegionStep(make_loss(3), method)
     actor, critic, _ = make_networks()
-    with pytest.raises(ValueError, match="needs a TrustRegionLoss.*got PPOLoss"):
+    with pytest.raises(ValueError, match=r"needs a TrustRegionLoss.*got PPOLoss"):
         TrustRegionStep(PPOLoss(actor, critic), method)
 
 
 @pytest.mark.parametrize("loss_class", [ClipPPOLoss, KLPENPPOLoss])
 def test_clipped_and_penalized_surrogates_are_refused(loss_class):
     actor, critic, _ = make_networks()
-    with pytest.raises(ValueError, match=f"loss_module.*{loss_class.__name__}"):
+    with pytest.raises(ValueError, match=rf"loss_module.*{loss_class.__name__}"):
         TrustRegionStep(loss_class(actor, critic))
 
 
 def test_other_bad_losses_are_refused():
-    with pytest.raises(ValueError, match="loss_module.*got Linear"):
+    with pytest.raises(ValueError, match=r"loss_module.*got Linear"):
         TrustRegionStep(nn.Linear(1, 1))
     with pytest.raises(ValueError, match="reduction='mean', got 'sum'"):
         TrustRegionStep(make_loss(reduction="sum"))
@@ -554,7 +574,7 @@ def test_other_bad_losses_are_refused():
     ],
 )
 def test_numbers_out_of_range_are_named(name, value):
-    with pytest.raises(ValueError, match=f"{name}.*{value}"):
+    with pytest.raises(ValueError, match=rf"{name}.*{value}"):
         TrustRegionStep(make_loss(), **{name: value})
 
 
@@ -574,7 +594,7 @@ def test_state_round_trip():
     loss.cost_violation.fill_(1000.0)
     step = TrustRegionStep(loss, CPO(), max_kl=MAX_KL)
     step.step(make_data(loss))
-    step.max_backtracks, step.max_kl = 0, 1e-12
+    step.method = Fixed(1e6)
     step.step(make_data(loss))
     assert step.state_dict() == {"rejected_steps": 1, "indefinite_steps": 0, "recovery_steps": 1}
 
@@ -583,7 +603,7 @@ def test_state_round_trip():
     resumed = TrustRegionStep(resumed_loss, CPO(), max_kl=MAX_KL)
     resumed.load_state_dict(step.state_dict())
     assert resumed.state_dict() == step.state_dict()
-    step.max_backtracks, step.max_kl = 10, MAX_KL
+    step.method = CPO()
     data = make_data(loss, seed=3)
     assert (step.step(data) == resumed.step(data)).all()
     assert torch.equal(actor_state(resumed_loss), actor_state(loss))
