@@ -29,12 +29,13 @@ ENVS = 512
 class TwoActions(EnvBase):
     """Many copies of the problem side by side."""
 
-    def __init__(self):
+    def __init__(self, num_costs=2):
         super().__init__(batch_size=[ENVS])
+        self.num_costs = num_costs
         self.observation_spec = Composite(observation=Unbounded((ENVS, 1)), shape=[ENVS])
         self.action_spec = OneHot(2, shape=(ENVS, 2))
         self.reward_spec = Composite(
-            reward=Unbounded((ENVS, 1)), cost=Unbounded((ENVS, 2)), shape=[ENVS]
+            reward=Unbounded((ENVS, 1)), cost=Unbounded((ENVS, num_costs)), shape=[ENVS]
         )
 
     def _reset(self, tensordict=None, **kwargs):
@@ -46,7 +47,7 @@ class TwoActions(EnvBase):
         return TensorDict(
             observation=torch.ones(ENVS, 1),
             reward=cost[:, :1],
-            cost=cost,
+            cost=cost[:, : self.num_costs],
             done=done,
             terminated=done,
             batch_size=[ENVS],
@@ -56,8 +57,8 @@ class TwoActions(EnvBase):
         torch.manual_seed(seed)
 
 
-def make_networks():
-    """Actor, critic and cost critic of two costs, each with one number or two to learn."""
+def make_networks(num_costs=2):
+    """Actor, critic and cost critic, each with one number or two to learn."""
     actor = ProbabilisticActor(
         TensorDictModule(nn.Linear(1, 2), ["observation"], ["logits"]),
         in_keys=["logits"],
@@ -65,7 +66,9 @@ def make_networks():
         return_log_prob=True,
     )
     critic = ValueOperator(nn.Linear(1, 1), in_keys=["observation"])
-    cost_critic = ValueOperator(nn.Linear(1, 2), in_keys=["observation"], out_keys=["cost_value"])
+    cost_critic = ValueOperator(
+        nn.Linear(1, num_costs), in_keys=["observation"], out_keys=["cost_value"]
+    )
     return actor, critic, cost_critic
 
 
@@ -83,19 +86,19 @@ def learn(loss, optimizer, buffer):
     epochs(loss, optimizer, buffer)
 
 
-def train(seed, make_loss, rule, batches, *, learn=learn, read=None, lr=0.1):
+def train(seed, make_loss, rule, batches, *, learn=learn, read=None, lr=0.1, num_costs=2):
     """Share of action A batch by batch, and what ``read`` reads off the loss after each.
 
     ``make_loss`` is called with actor, critic and cost critic, ``rule`` with the loss and the
-    limits; ``None`` for a rule that nothing moves.
+    limits; ``None`` for a rule that nothing moves. ``num_costs=1`` leaves the second cost out.
     """
     torch.manual_seed(seed)
-    actor, critic, cost_critic = make_networks()
+    actor, critic, cost_critic = make_networks(num_costs)
     loss = make_loss(actor, critic, cost_critic)
-    updater = rule(loss, cost_limit=LIMITS) if rule else None
+    updater = rule(loss, cost_limit=LIMITS[:num_costs]) if rule else None
     optimizer = torch.optim.SGD(loss.parameters(), lr=lr)
     collector = Collector(
-        TwoActions(),
+        TwoActions(num_costs),
         actor,
         frames_per_batch=ENVS,
         total_frames=batches * ENVS,

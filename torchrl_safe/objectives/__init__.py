@@ -11,9 +11,15 @@ from torchrl_safe.objectives.multipliers import DualAscent, MultiplierUpdater
 from torchrl_safe.objectives.p3o import P3OLoss
 from torchrl_safe.objectives.pid_control import PIDControl
 from torchrl_safe.objectives.ppo_lagrangian import PPOLagrangianLoss
+from torchrl_safe.objectives.trust_region_loss import TrustRegionLoss
+from torchrl_safe.objectives.trust_region_methods import CPO, PCPO, TRPO, TrustRegionMethod
+from torchrl_safe.objectives.trust_region_step import TrustRegionStep
 from torchrl_safe.objectives.violation import ViolationUpdater
 
 __all__ = [
+    "CPO",
+    "PCPO",
+    "TRPO",
     "CRPOLoss",
     "CUPLoss",
     "CostGAE",
@@ -25,6 +31,9 @@ __all__ = [
     "P3OLoss",
     "PIDControl",
     "PPOLagrangianLoss",
+    "TrustRegionLoss",
+    "TrustRegionMethod",
+    "TrustRegionStep",
     "ViolationUpdater",
     "penalized_advantage",
 ]

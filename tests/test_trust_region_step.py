@@ -1,0 +1,609 @@
+"""TrustRegionStep on small policies: bounds, reductions, refusals, counts and state."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from networks import ACTION, OBSERVATION, make_actor, make_batch, make_critic, make_networks, mlp
+from tensordict import TensorDict
+from tensordict.nn import (
+    CompositeDistribution,
+    NormalParamExtractor,
+    TensorDictModule,
+    set_composite_lp_aggregate,
+)
+from torch import nn
+from torch.distributions import Categorical, kl_divergence
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import (
+    IndependentNormal,
+    OneHotCategorical,
+    ProbabilisticActor,
+    TanhNormal,
+    TruncatedNormal,
+)
+from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, PPOLoss
+
+from torchrl_safe.objectives import (
+    CPO,
+    PCPO,
+    TRPO,
+    DualAscent,
+    PIDControl,
+    TrustRegionLoss,
+    TrustRegionMethod,
+    TrustRegionStep,
+    ViolationUpdater,
+)
+from torchrl_safe.objectives.trust_region_methods import TrustRegionSolution
+
+MAX_KL = 0.01
+BATCH = 256
+METHODS = {
+    "trpo": TRPO(),
+    "cpo": CPO(),
+    "pcpo": PCPO(),
+    "pcpo-euclid": PCPO(kl_projection=False),
+}
+
+
+def normal_actor(distribution):
+    policy = nn.Sequential(mlp(OBSERVATION, 2 * ACTION), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=distribution,
+        return_log_prob=True,
+    )
+
+
+def discrete_actor(distribution):
+    return ProbabilisticActor(
+        TensorDictModule(mlp(OBSERVATION, 3), ["observation"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=distribution,
+        return_log_prob=True,
+    )
+
+
+ACTORS = {
+    "normal": lambda: normal_actor(IndependentNormal),
+    "tanh-normal": lambda: normal_actor(TanhNormal),
+    "categorical": lambda: discrete_actor(Categorical),
+    "one-hot": lambda: discrete_actor(OneHotCategorical),
+}
+
+
+def make_loss(num_costs=1, actor="normal", seed=0, **kwargs):
+    torch.manual_seed(seed)
+    networks = ACTORS[actor](), make_critic(), make_critic("cost_value", num_costs)
+    return TrustRegionLoss(*networks, num_costs=num_costs, **{"entropy_bonus": False, **kwargs})
+
+
+def act(loss, data):
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        return loss.actor_network(data)
+
+
+def make_data(loss, seed=1):
+    """A batch by the present actor; what pays, costs too."""
+    torch.manual_seed(seed)
+    data = act(loss, TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH]))
+    action = data["action"].float().reshape(BATCH, -1)
+    slope = torch.randn(action.shape[-1], 1)
+    advantage = action @ slope + 0.3 * torch.randn(BATCH, 1)
+    data["advantage"] = (advantage - advantage.mean()) / advantage.std()
+    cost = action @ (slope + 0.5 * torch.randn(action.shape[-1], 3)) + 0.3 * torch.randn(BATCH, 3)
+    data["cost_advantage"] = (cost - cost.mean(0))[:, : getattr(loss, "num_costs", 1)]
+    data["value_target"] = torch.randn(BATCH, 1)
+    data["cost_value_target"] = torch.randn_like(data["cost_advantage"])
+    return data
+
+
+def actor_state(loss):
+    return torch.cat([p.detach().flatten() for p in loss.actor_network_params.parameters()])
+
+
+def critic_state(loss):
+    params = loss.critic_network_params, loss.cost_critic_network_params
+    return torch.cat([p.detach().flatten() for group in params for p in group.parameters()])
+
+
+def distribution(loss, data):
+    with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
+        return loss.actor_network.get_dist(data.clone())
+
+
+# ---------------------------------------------------------------- what a step keeps
+
+
+@pytest.mark.parametrize("violation", [-100.0, -0.2, 0.2, 100.0])
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
+@pytest.mark.parametrize("actor", ACTORS)
+def test_a_step_keeps_divergence_and_cost_within_bounds(actor, method, violation):
+    loss = make_loss(actor=actor)
+    loss.cost_violation.fill_(violation)
+    data = make_data(loss)
+    old, before, critics = distribution(loss, data), actor_state(loss), critic_state(loss)
+    old_cost, old_loss = loss.cost_surrogate_loss(data), loss(data)["loss_objective"]
+    step = TrustRegionStep(loss, method, max_kl=MAX_KL, episode_length=10.0)
+    info = step.step(data)
+    assert not torch.equal(actor_state(loss), before)
+    assert torch.equal(critic_state(loss), critics)
+    kl = kl_divergence(old, distribution(loss, data)).mean()
+    assert 0 < kl <= MAX_KL
+    torch.testing.assert_close(info["kl"], kl)
+    assert 0 < info["step_fraction"] <= 1
+    rise = (loss.cost_surrogate_loss(data) - old_cost).item()
+    gain = (old_loss - loss(data)["loss_objective"]).item()
+    assert info["surrogate_gain"].item() == pytest.approx(gain, abs=1e-6)
+    assert step.rejected_steps == step.indefinite_steps == 0
+    if method.constrained:
+        assert info["cost_surrogate_change"].item() == pytest.approx(rise, abs=1e-6)
+        assert rise <= max(-violation / 10, 0) + 1e-6
+        assert rise < 0 or violation <= 0
+    else:
+        assert gain > 0
+        assert info["cost_surrogate_change"] == 0
+
+
+def test_the_step_is_the_natural_gradient():
+    """A linear mean, fixed unit deviations: H is the mean of x x^T for each action dimension."""
+    actor = ProbabilisticActor(
+        TensorDictModule(
+            nn.Sequential(nn.Linear(OBSERVATION, 1, bias=False), ConstantDeviation()),
+            ["observation"],
+            ["loc", "scale"],
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    torch.manual_seed(0)
+    loss = PPOLoss(actor.double(), make_critic().double(), entropy_bonus=False)
+    data = TensorDict(observation=torch.randn(BATCH, OBSERVATION).double(), batch_size=[BATCH])
+    data = act(loss, data)
+    data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1).double()
+    before = actor_state(loss)
+    info = TrustRegionStep(loss, max_kl=1e-6, damping=0.0, cg_iterations=20).step(data)
+    # The score of a unit normal is (action - mean) x.
+    observation = data["observation"]
+    score = (data["action"] - data["loc"]) * observation
+    gradient = (score * data["advantage"]).mean(0)
+    natural = torch.linalg.solve(observation.T @ observation / BATCH, gradient)
+    expected = (2e-6 / (gradient @ natural)).sqrt() * natural * info["step_fraction"]
+    # This divergence is quadratic, so that the full step lies on the bound, to rounding.
+    assert info["step_fraction"] in (1.0, 0.8)
+    torch.testing.assert_close(actor_state(loss) - before, expected, rtol=1e-6, atol=1e-12)
+
+
+class ConstantDeviation(nn.Module):
+    def forward(self, loc):
+        return loc, torch.ones_like(loc)
+
+
+# ---------------------------------------------------------------- reductions
+
+
+def train(method, loss, steps=5, violation=None):
+    step = TrustRegionStep(loss, method, max_kl=MAX_KL)
+    if violation is not None:
+        loss.cost_violation.fill_(violation)
+    return [step.step(make_data(loss, seed))["kl"] for seed in range(steps)], actor_state(loss)
+
+
+@pytest.mark.parametrize("actor", ACTORS)
+@pytest.mark.parametrize("method", ["cpo", "pcpo", "pcpo-euclid"])
+def test_with_a_limit_that_never_binds_it_is_trpo_bit_for_bit(method, actor):
+    kls, parameters = train(METHODS[method], make_loss(actor=actor), violation=-1e6)
+    expected_kls, expected = train(TRPO(), make_loss(actor=actor))
+    assert kls == expected_kls
+    assert torch.equal(parameters, expected)
+
+
+@pytest.mark.parametrize("num_costs", [1, 3])
+@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
+def test_trpo_lagrangian_with_multiplier_zero_is_trpo_bit_for_bit(functional, num_costs):
+    loss = make_loss(num_costs, functional=functional)
+    torch.manual_seed(0)
+    ppo = PPOLoss(ACTORS["normal"](), make_critic(), entropy_bonus=False)
+    for seed in range(5):
+        data = make_data(ppo, seed)
+        data["cost_advantage"] = torch.randn(BATCH, num_costs)
+        data["cost_value_target"] = torch.randn(BATCH, num_costs)
+        infos = [TrustRegionStep(each, max_kl=MAX_KL).step(data) for each in (loss, ppo)]
+        assert (infos[0] == infos[1]).all()
+    parameters = torch.cat([p.detach().flatten() for p in loss.actor_network.parameters()])
+    if functional:
+        parameters = actor_state(loss)
+    assert torch.equal(parameters, actor_state(ppo))
+
+
+def test_a_very_large_multiplier_lowers_its_cost_only():
+    """With three costs and a multiplier of one of them that drowns all else."""
+    loss = make_loss(3)
+    DualAscent(loss, cost_limit=0.0, lr=1e6).step(torch.tensor([[0.0, 1.0, 0.0]]))
+    data = make_data(loss)
+    before = loss.cost_surrogate_loss(data)
+    TrustRegionStep(loss, max_kl=MAX_KL).step(data)
+    assert (loss.cost_surrogate_loss(data) - before)[1] < -0.01
+
+    alone = make_loss(3)
+    data["advantage"] = -data["cost_advantage"][:, 1:2]
+    TrustRegionStep(alone, max_kl=MAX_KL).step(data)
+    torch.testing.assert_close(actor_state(loss), actor_state(alone), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("num_costs", [1, 3])
+def test_every_multiplier_rule_changes_the_step(num_costs):
+    def stepped(rule):
+        loss = make_loss(num_costs)
+        if rule:
+            rule(loss).step(torch.full((2, num_costs), 3.0))
+        TrustRegionStep(loss, max_kl=MAX_KL).step(make_data(loss))
+        return actor_state(loss)
+
+    plain = stepped(None)
+    dual = stepped(lambda loss: DualAscent(loss, cost_limit=1.0, lr=0.5))
+    # Both rules give the multiplier 1: 0.5 * 2 and 0.25 * 2 + 0.25 * 2.
+    pid = stepped(lambda loss: PIDControl(loss, cost_limit=1.0, kp=0.25, ki=0.25, kd=0.0))
+    assert torch.equal(dual, pid)
+    assert not torch.equal(dual, plain)
+
+
+def test_the_violation_is_divided_by_the_length_of_an_episode():
+    """100 above the limit in 1000 steps is 0.1 in one; by default in 1 / (1 - gamma) of them."""
+
+    def stepped(violation, gamma=0.99, **kwargs):
+        loss = make_loss()
+        loss.make_cost_value_estimator(gamma=gamma)
+        loss.cost_violation.fill_(violation)
+        TrustRegionStep(loss, CPO(), max_kl=MAX_KL, **kwargs).step(make_data(loss))
+        return actor_state(loss)
+
+    expected = stepped(0.01, episode_length=1)
+    assert not torch.equal(stepped(0.02, episode_length=1), expected)
+    torch.testing.assert_close(stepped(10.0, episode_length=1000), expected)
+    torch.testing.assert_close(stepped(0.5, gamma=0.98), expected)
+    with pytest.raises(ValueError, match=r"episode_length must be given if gamma .* is 1"):
+        stepped(0.5, gamma=1.0)
+
+
+def test_recovery_lowers_the_cost_whatever_the_reward():
+    loss = make_loss()
+    ViolationUpdater(loss, cost_limit=1.0).step(torch.tensor([[1000.0]]))
+    step = TrustRegionStep(loss, CPO(), max_kl=MAX_KL)
+    data = make_data(loss)
+    data["advantage"] = data["cost_advantage"] / data["cost_advantage"].std()
+    info = step.step(data)
+    assert step.recovery_steps == info["recovery_steps"] == 1
+    assert info["constraint_active"]
+    assert info["cost_surrogate_change"] < 0
+    assert info["surrogate_gain"] < 0
+
+
+# ---------------------------------------------------------------- kinds of actors and batches
+
+
+def test_a_composite_action():
+    with set_composite_lp_aggregate(False):
+        network = nn.Sequential(mlp(OBSERVATION, 4), SplitParameters())
+        actor = ProbabilisticActor(
+            TensorDictModule(
+                network,
+                ["observation"],
+                [("params", "a", "loc"), ("params", "a", "scale"), ("params", "b", "logits")],
+            ),
+            in_keys=["params"],
+            out_keys=["a", "b"],
+            distribution_class=CompositeDistribution,
+            distribution_kwargs={"distribution_map": {"a": IndependentNormal, "b": Categorical}},
+            return_log_prob=True,
+        )
+        torch.manual_seed(0)
+        loss = PPOLoss(actor, make_critic(), entropy_bonus=False)
+        data = TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH])
+        data = act(loss, data)
+        data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1)
+        old = distribution(loss, data)
+        info = TrustRegionStep(loss, max_kl=MAX_KL).step(data)
+        new = distribution(loss, data)
+    parts = [kl_divergence(old.dists[name], new.dists[name]).mean() for name in ("a", "b")]
+    torch.testing.assert_close(info["kl"], sum(parts))
+    assert min(parts) > 0
+    assert info["kl"] <= MAX_KL
+
+
+class SplitParameters(nn.Module):
+    def forward(self, raw):
+        return raw[..., :1], raw[..., 1:2].exp(), raw[..., 2:]
+
+
+def test_nested_keys():
+    def stepped(nest):
+        name = (lambda key: ("agent", key)) if nest else (lambda key: key)
+        torch.manual_seed(0)
+        loss = TrustRegionLoss(
+            make_actor(name("observation"), name("action")),
+            make_critic(name("state_value"), observation=name("observation")),
+            make_critic(name("cost_value"), observation=name("observation")),
+            entropy_bonus=False,
+        )
+        loss.set_keys(
+            value=name("state_value"),
+            cost_value=name("cost_value"),
+            cost=name("cost"),
+            advantage=name("advantage"),
+            cost_advantage=name("cost_advantage"),
+            value_target=name("value_target"),
+            cost_value_target=name("cost_value_target"),
+        )
+        batch = make_batch()
+        if nest:
+            batch.rename_key_("observation", name("observation"))
+            batch.rename_key_("action", name("action"))
+            batch.rename_key_("action_log_prob", loss.tensor_keys.sample_log_prob)
+            batch["next"].rename_key_("observation", name("observation"))
+            batch["next"].rename_key_("cost", name("cost"))
+        data = loss.estimate_advantages(batch).reshape(-1)
+        TrustRegionStep(loss, CPO(), max_kl=MAX_KL).step(data)
+        return actor_state(loss)
+
+    assert torch.equal(stepped(nest=True), stepped(nest=False))
+
+
+def test_masked_steps_count_nowhere():
+    def stepped(masked):
+        loss = make_loss()
+        data = make_data(loss)
+        mask = torch.arange(BATCH) % 3 > 0
+        if not masked:
+            return TrustRegionStep(loss, CPO(), max_kl=MAX_KL).step(data[mask]), actor_state(loss)
+        data["collector", "mask"] = mask
+        data["advantage"][~mask] = 1e6
+        return TrustRegionStep(loss, CPO(), max_kl=MAX_KL).step(data), actor_state(loss)
+
+    (info, parameters), (expected_info, expected) = stepped(True), stepped(False)
+    torch.testing.assert_close(parameters, expected)
+    torch.testing.assert_close(info["kl"], expected_info["kl"])
+
+
+def test_the_actor_that_the_user_holds_moves_in_place():
+    actor, critic, cost_critic = make_networks()
+    loss = TrustRegionLoss(actor, critic, cost_critic, entropy_bonus=False)
+    addresses = [p.data_ptr() for p in actor.parameters()]
+    before = [p.detach().clone() for p in actor.parameters()]
+    TrustRegionStep(loss, max_kl=MAX_KL).step(make_data(loss))
+    assert [p.data_ptr() for p in actor.parameters()] == addresses
+    assert all(not torch.equal(p, old) for p, old in zip(actor.parameters(), before, strict=True))
+    assert all(p.grad is None for p in loss.parameters())
+
+
+def test_frozen_parameters_stay():
+    loss = make_loss()
+    frozen = next(iter(loss.actor_network_params.parameters()))
+    frozen.requires_grad_(False)
+    before = frozen.clone()
+    info = TrustRegionStep(loss, max_kl=MAX_KL).step(make_data(loss))
+    assert info["step_fraction"] > 0
+    assert torch.equal(frozen, before)
+
+
+def test_it_steps_where_gradients_are_off():
+    expected = make_loss()
+    TrustRegionStep(expected, max_kl=MAX_KL).step(make_data(expected))
+    loss = make_loss()
+    with torch.no_grad():
+        TrustRegionStep(loss, max_kl=MAX_KL).step(make_data(loss))
+    assert torch.equal(actor_state(loss), actor_state(expected))
+
+
+def test_the_entropy_bonus_is_a_part_of_the_surrogate():
+    """With no advantage at all the deviations grow."""
+    loss = make_loss(entropy_bonus=True, entropy_coeff=0.1)
+    data = make_data(loss)
+    data["advantage"].zero_()
+    before = distribution(loss, data).entropy().mean()
+    TrustRegionStep(loss, max_kl=MAX_KL).step(data)
+    assert distribution(loss, data).entropy().mean() > before + 0.05
+
+
+# ---------------------------------------------------------------- steps that are not taken
+
+
+@dataclass(frozen=True)
+class Fixed(TrustRegionMethod):
+    """A step against, or far beyond, all that is asked of one."""
+
+    scale: float
+    constrained = False
+
+    def __call__(self, problem):
+        return TrustRegionSolution(self.scale * problem.gradient)
+
+
+def test_a_line_search_that_fails_leaves_the_actor_bit_for_bit():
+    loss = make_loss()
+    step = TrustRegionStep(loss, Fixed(1e4), max_kl=MAX_KL, max_backtracks=2)
+    before = actor_state(loss)
+    for count in (1, 2):
+        info = step.step(make_data(loss))
+        assert torch.equal(actor_state(loss), before)
+        assert step.rejected_steps == info["rejected_steps"] == count
+        assert info["step_fraction"] == info["kl"] == 0
+
+
+def test_a_step_that_does_not_gain_what_it_promised_is_refused():
+    """All actions are good: to first order a little is gained, far away they are all gone."""
+    loss = make_loss()
+    data = make_data(loss)
+    data["advantage"].fill_(1.0)
+    step = TrustRegionStep(loss, Fixed(100.0), max_kl=1e6, max_backtracks=0)
+    before = actor_state(loss)
+    step.step(data)
+    assert step.rejected_steps == 1
+    assert torch.equal(actor_state(loss), before)
+
+
+@pytest.mark.parametrize("actor", ACTORS)
+def test_a_step_without_end_is_refused(actor):
+    loss = make_loss(actor=actor)
+    before = actor_state(loss)
+    step = TrustRegionStep(loss, Fixed(float("inf")))
+    step.step(make_data(loss))
+    assert step.rejected_steps == 1
+    assert torch.equal(actor_state(loss), before)
+
+
+class Guard(nn.Module):
+    def forward(self, logits):
+        if not logits.isfinite().all():
+            raise RuntimeError("logits are not finite")
+        return logits
+
+
+def test_an_actor_that_raises_in_the_line_search_is_left_bit_for_bit():
+    actor = discrete_actor(Categorical)
+    actor.module[0].module.append(Guard())
+    loss = PPOLoss(actor, make_critic(), entropy_bonus=False)
+    before = actor_state(loss)
+    with pytest.raises(RuntimeError, match="logits are not finite"):
+        TrustRegionStep(loss, Fixed(float("inf"))).step(make_data(loss))
+    assert torch.equal(actor_state(loss), before)
+
+
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
+def test_an_indefinite_fisher_matrix_leaves_the_actor_bit_for_bit(method):
+    loss = make_loss()
+    data = make_data(loss)
+    step = TrustRegionStep(loss, method)
+    step.damping = -1e3  # No policy has a negative bend of its own, but for rounding.
+    before = actor_state(loss)
+    info = step.step(data)
+    assert torch.equal(actor_state(loss), before)
+    assert step.indefinite_steps == info["indefinite_steps"] == 1
+    assert step.rejected_steps == 0
+
+
+@pytest.mark.parametrize("name", ["reward", "cost"])
+def test_a_gradient_that_is_not_finite_is_refused(name):
+    loss = make_loss()
+    data = make_data(loss)
+    data["advantage" if name == "reward" else "cost_advantage"][3] = float("nan")
+    before = actor_state(loss)
+    with pytest.raises(ValueError, match=r"gradient of the (reward|cost) surrogate.*nan"):
+        TrustRegionStep(loss, CPO()).step(data)
+    assert torch.equal(actor_state(loss), before)
+
+
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
+def test_without_any_advantage_nothing_moves_and_nothing_is_refused(method):
+    loss = make_loss()
+    data = make_data(loss)
+    data["advantage"].zero_()
+    data["cost_advantage"].zero_()
+    before = actor_state(loss)
+    step = TrustRegionStep(loss, method)
+    info = step.step(data)
+    assert torch.equal(actor_state(loss), before)
+    assert info["step_fraction"] == 0
+    assert set(step.state_dict().values()) == {0}
+
+
+def test_without_cost_gradient_cpo_is_trpo():
+    expected, loss = make_loss(), make_loss()
+    data = make_data(loss)
+    data["cost_advantage"].zero_()
+    loss.cost_violation.fill_(5.0)
+    TrustRegionStep(loss, CPO(), max_kl=MAX_KL).step(data)
+    TrustRegionStep(expected, max_kl=MAX_KL).step(data)
+    assert torch.equal(actor_state(loss), actor_state(expected))
+
+
+# ---------------------------------------------------------------- refusals at the door
+
+
+@pytest.mark.parametrize("key", ["advantage", "cost_advantage"])
+def test_a_missing_advantage_is_named(key):
+    loss = make_loss()
+    with pytest.raises(KeyError, match=f"'{key}'"):
+        TrustRegionStep(loss, CPO()).step(make_data(loss).exclude(key))
+
+
+@pytest.mark.parametrize("method", [CPO(), PCPO()], ids=["cpo", "pcpo"])
+def test_one_cost_and_a_cost_critic_are_asked_for(method):
+    with pytest.raises(ValueError, match=r"limits one cost.*has 3"):
+        TrustRegionStep(make_loss(3), method)
+    actor, critic, _ = make_networks()
+    with pytest.raises(ValueError, match=r"needs a TrustRegionLoss.*got PPOLoss"):
+        TrustRegionStep(PPOLoss(actor, critic), method)
+
+
+@pytest.mark.parametrize("loss_class", [ClipPPOLoss, KLPENPPOLoss])
+def test_clipped_and_penalized_surrogates_are_refused(loss_class):
+    actor, critic, _ = make_networks()
+    with pytest.raises(ValueError, match=rf"loss_module.*{loss_class.__name__}"):
+        TrustRegionStep(loss_class(actor, critic))
+
+
+def test_other_bad_losses_are_refused():
+    with pytest.raises(ValueError, match=r"loss_module.*got Linear"):
+        TrustRegionStep(nn.Linear(1, 1))
+    with pytest.raises(ValueError, match="reduction='mean', got 'sum'"):
+        TrustRegionStep(make_loss(reduction="sum"))
+    loss = make_loss()
+    for parameter in loss.actor_network_params.parameters():
+        parameter.requires_grad_(False)
+    with pytest.raises(ValueError, match="no trainable parameter"):
+        TrustRegionStep(loss)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_kl", 0.0),
+        ("max_kl", float("nan")),
+        ("max_kl", float("inf")),
+        ("damping", -0.1),
+        ("cg_iterations", 0),
+        ("shrink", 1.0),
+        ("shrink", 0.0),
+        ("max_backtracks", -1),
+        ("episode_length", 0),
+        ("episode_length", float("inf")),
+    ],
+)
+def test_numbers_out_of_range_are_named(name, value):
+    with pytest.raises(ValueError, match=rf"{name}.*{value}"):
+        TrustRegionStep(make_loss(), **{name: value})
+
+
+def test_a_policy_without_a_divergence_in_closed_form_is_refused():
+    torch.manual_seed(0)
+    loss = PPOLoss(normal_actor(TruncatedNormal), make_critic(), entropy_bonus=False)
+    with pytest.raises(NotImplementedError, match="TruncatedNormal"):
+        TrustRegionStep(loss).step(make_data(loss))
+
+
+# ---------------------------------------------------------------- state
+
+
+def test_state_round_trip():
+    """Counts go over, and a resumed run takes the same steps."""
+    loss = make_loss()
+    loss.cost_violation.fill_(1000.0)
+    step = TrustRegionStep(loss, CPO(), max_kl=MAX_KL)
+    step.step(make_data(loss))
+    step.method = Fixed(1e6)
+    step.step(make_data(loss))
+    assert step.state_dict() == {"rejected_steps": 1, "indefinite_steps": 0, "recovery_steps": 1}
+
+    resumed_loss = make_loss(seed=5)
+    resumed_loss.load_state_dict(loss.state_dict())
+    resumed = TrustRegionStep(resumed_loss, CPO(), max_kl=MAX_KL)
+    resumed.load_state_dict(step.state_dict())
+    assert resumed.state_dict() == step.state_dict()
+    step.method = CPO()
+    data = make_data(loss, seed=3)
+    assert (step.step(data) == resumed.step(data)).all()
+    assert torch.equal(actor_state(resumed_loss), actor_state(loss))

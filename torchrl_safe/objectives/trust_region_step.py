@@ -1,0 +1,332 @@
+"""The step of the trust-region methods, in the place of ``optimizer.step()`` for the actor."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, PPOLoss
+
+from torchrl_safe.objectives._actor import (
+    actor_distribution,
+    actor_parameters,
+    divergence,
+    read_flat,
+    write_flat,
+)
+from torchrl_safe.objectives._cost_critic import get_or_raise
+from torchrl_safe.objectives.trust_region import (
+    NotPositiveDefiniteError,
+    backtracking_line_search,
+    conjugate_gradient,
+    fisher_vector_product,
+    flat_gradient,
+)
+from torchrl_safe.objectives.trust_region_loss import TrustRegionLoss
+from torchrl_safe.objectives.trust_region_methods import (
+    TRPO,
+    TrustRegionMethod,
+    TrustRegionProblem,
+    TrustRegionSolution,
+)
+
+
+class TrustRegionStep:
+    r"""Moves the actor of a loss once for each collected batch, within a trust region.
+
+    The gradients of the surrogates are solved by conjugate gradients against the Fisher matrix,
+    ``method`` makes a step of them, and a line search shortens it until
+
+    - the mean divergence from the policy before the step is at most ``max_kl``;
+    - the reward surrogate has grown, if the step promises that and is no recovery;
+    - under a constraint, the cost surrogate has grown by no more than the distance to the limit,
+      or not at all above it
+
+    (Achiam et al. 2017, https://arxiv.org/abs/1705.10528, section 6.1). If no length will do, or
+    the damped Fisher matrix is found not to be positive definite, the parameters stay as they
+    were, bit for bit, and ``rejected_steps`` or ``indefinite_steps`` counts it.
+
+    The surrogates are means over steps, a limit is one of whole episodes: the loss's
+    ``cost_violation`` is divided by the length of an episode before ``method`` gets it, which is
+    the factor :math:`1 - \gamma` of the paper's equation 10.
+
+    Args:
+        loss_module (PPOLoss): :class:`~torchrl.objectives.PPOLoss` for TRPO alone, else a
+            :class:`~torchrl_safe.objectives.TrustRegionLoss`. The actor shares no parameter
+            with a critic, or the step moves that too. Of the losses, ``"loss_objective"`` and,
+            if there is one, ``"loss_entropy"`` are the surrogate. (An entropy estimated from
+            samples makes the line search noisy: better ``entropy_bonus=False``.)
+        method (TrustRegionMethod, optional): :class:`~torchrl_safe.objectives.CPO`,
+            :class:`~torchrl_safe.objectives.PCPO`, or by default
+            :class:`~torchrl_safe.objectives.TRPO`, which with multipliers is TRPO-Lagrangian.
+
+    Keyword Args:
+        episode_length (float, optional): mean number of steps of an episode, with which
+            a surrogate becomes the change of an episode's cost. Defaults to
+            ``1 / (1 - gamma)`` of the cost's value estimator.
+        max_kl (float, optional): bound on the mean divergence of one step, in nats.
+            Defaults to ``0.01``.
+        damping (float, optional): multiple of the identity added to the Fisher matrix.
+            Defaults to ``0.1``.
+        cg_iterations (int, optional): iterations of
+            :func:`~torchrl_safe.objectives.trust_region.conjugate_gradient`.
+            Defaults to ``10``.
+        shrink (float, optional): see
+            :func:`~torchrl_safe.objectives.trust_region.backtracking_line_search`.
+            Defaults to ``0.8``.
+        max_backtracks (int, optional): see there. Defaults to ``10``.
+
+    Raises:
+        ValueError: if the loss is of another kind, clipped or not averaged, has no trainable
+            actor, or other costs than the one that ``method`` can limit; or if a number is out
+            of its range.
+
+    The actor's distribution must have a divergence in closed form: normal, ``TanhNormal`` and
+    categorical ones, and composites of them.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.modules import OneHotCategorical, ProbabilisticActor, ValueOperator
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(torch.nn.Linear(4, 3), ["observation"], ["logits"]),
+        ...     in_keys=["logits"],
+        ...     distribution_class=OneHotCategorical,
+        ...     return_log_prob=True,
+        ... )
+        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
+        >>> loss = PPOLoss(actor, critic, entropy_bonus=False)
+        >>> step = TrustRegionStep(loss, max_kl=0.01)
+        >>> batch = TensorDict(observation=torch.randn(8, 4), batch_size=[8])
+        >>> with torch.no_grad():
+        ...     batch = actor(batch)
+        >>> batch["advantage"], batch["value_target"] = torch.randn(8, 1), torch.randn(8, 1)
+        >>> info = step.step(batch)
+        >>> bool(info["kl"] <= 0.01), step.rejected_steps
+        (True, 0)
+    """
+
+    def __init__(
+        self,
+        loss_module: PPOLoss,
+        method: TrustRegionMethod = TRPO(),
+        *,
+        episode_length: float | None = None,
+        max_kl: float = 0.01,
+        damping: float = 0.1,
+        cg_iterations: int = 10,
+        shrink: float = 0.8,
+        max_backtracks: int = 10,
+    ) -> None:
+        _check_loss(loss_module, method)
+        for name, value, allowed in (
+            (
+                "episode_length",
+                episode_length,
+                episode_length is None or 0 < episode_length < math.inf,
+            ),
+            ("max_kl", max_kl, 0 < max_kl < math.inf),
+            ("damping", damping, 0 <= damping < math.inf),
+            ("cg_iterations", cg_iterations, cg_iterations >= 1),
+            ("shrink", shrink, 0 < shrink < 1),
+            ("max_backtracks", max_backtracks, max_backtracks >= 0),
+        ):
+            if not allowed:
+                raise ValueError(f"{name} is out of its range, got {value}.")
+        self.loss_module = loss_module
+        self.method = method
+        self.episode_length = episode_length
+        self.max_kl = max_kl
+        self.damping = damping
+        self.cg_iterations = cg_iterations
+        self.shrink = shrink
+        self.max_backtracks = max_backtracks
+        self.rejected_steps = 0
+        self.indefinite_steps = 0
+        self.recovery_steps = 0
+
+    def step(self, tensordict: TensorDictBase) -> TensorDict:
+        """Moves the actor once.
+
+        Args:
+            tensordict (TensorDictBase): the whole batch, collected by the present actor, with
+                ``advantage`` and, for a constrained method, ``cost_advantage``, as
+                ``estimate_advantages`` writes them. Give the batch's episode costs to the updater
+                of the loss before.
+
+        Returns:
+            Numbers to log, each of shape ``()``: ``kl``, ``surrogate_gain``,
+            ``cost_surrogate_change`` (0 without a constraint), ``step_fraction`` that the line
+            search let stand (0 if the actor has not moved), ``constraint_active``, and the counts
+            ``rejected_steps``, ``indefinite_steps`` and ``recovery_steps``.
+
+        Raises:
+            KeyError: if an advantage is missing.
+            ValueError: if the gradient of a surrogate is not finite, or the length of an episode
+                is not known; nothing has changed then.
+            NotImplementedError: if the divergence of the policy has no closed form.
+        """
+        keys = self.loss_module.tensor_keys
+        get_or_raise(tensordict, keys.advantage)
+        if self.method.constrained:
+            get_or_raise(tensordict, keys.cost_advantage)
+        with torch.enable_grad(), set_recurrent_mode(True):
+            try:
+                problem = self._local_problem(tensordict)
+            except NotPositiveDefiniteError:
+                self.indefinite_steps += 1
+                return self._report()
+            return self._search(tensordict, problem, self.method(problem))
+
+    def state_dict(self) -> dict[str, int]:
+        """Returns the counts; the actor is in the state of the loss."""
+        return {name: getattr(self, name) for name in _COUNTS}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Loads a state that :meth:`state_dict` returned."""
+        for name in _COUNTS:
+            setattr(self, name, state_dict[name])
+
+    def _violation(self) -> float:
+        if not self.method.constrained:
+            return 0.0
+        loss = self.loss_module
+        scale = 1 - float(loss.cost_value_estimator.gamma)
+        if self.episode_length is not None:
+            scale = 1 / self.episode_length
+        if not scale > 0:
+            raise ValueError("episode_length must be given if gamma of the costs is 1, got None.")
+        return scale * loss.cost_violation.item()
+
+    def _local_problem(self, tensordict: TensorDictBase) -> TrustRegionProblem:
+        parameters = actor_parameters(self.loss_module)
+        gradient = -self._checked_gradient(self._surrogate_loss(tensordict), "reward")
+        cost_gradient = torch.zeros_like(gradient)
+        if self.method.constrained:
+            cost_gradient = self._checked_gradient(self._cost_surrogate(tensordict), "cost")
+        distribution = actor_distribution(self.loss_module, tensordict)
+        with torch.no_grad():
+            fixed = actor_distribution(self.loss_module, tensordict)
+        product = fisher_vector_product(
+            self._mean_kl(fixed, distribution, tensordict), parameters, damping=self.damping
+        )
+        natural_gradient, natural_cost_gradient = (
+            conjugate_gradient(product, vector, max_iterations=self.cg_iterations)
+            for vector in (gradient, cost_gradient)
+        )
+        return TrustRegionProblem(
+            gradient,
+            natural_gradient,
+            self.max_kl,
+            cost_gradient,
+            natural_cost_gradient,
+            self._violation(),
+            product,
+        )
+
+    @torch.no_grad()
+    def _search(
+        self,
+        tensordict: TensorDictBase,
+        problem: TrustRegionProblem,
+        solution: TrustRegionSolution,
+    ) -> TensorDict:
+        if not solution.step.any():  # Nothing to gain, and nothing to refuse.
+            return self._report(constraint_active=solution.constraint_active)
+        parameters = actor_parameters(self.loss_module)
+        before = read_flat(parameters)
+        fixed = actor_distribution(self.loss_module, tensordict)
+        limited = self.method.constrained
+        old_loss = self._surrogate_loss(tensordict)
+        old_cost = self._cost_surrogate(tensordict) if limited else torch.zeros_like(old_loss)
+        asks_gain = not solution.recovery and bool(problem.gradient @ solution.step > 0)
+        measured: dict[str, Tensor] = {}
+
+        def accepts(fraction: float) -> bool:
+            write_flat(before + fraction * solution.step, parameters)
+            distribution = actor_distribution(self.loss_module, tensordict)
+            kl = self._mean_kl(fixed, distribution, tensordict)
+            gain = old_loss - self._surrogate_loss(tensordict)
+            rise = (self._cost_surrogate(tensordict) if limited else old_cost) - old_cost
+            measured.update(kl=kl, surrogate_gain=gain, cost_surrogate_change=rise)
+            return bool(
+                (kl <= self.max_kl)
+                & (gain > 0 if asks_gain else gain.isfinite())
+                & (rise <= max(-problem.violation, 0.0))
+            )
+
+        fraction = 0.0
+        try:
+            fraction = backtracking_line_search(
+                accepts, shrink=self.shrink, max_backtracks=self.max_backtracks
+            )
+        finally:
+            if not fraction:
+                write_flat(before, parameters)
+        if not fraction:
+            self.rejected_steps += 1
+            return self._report(constraint_active=solution.constraint_active)
+        self.recovery_steps += solution.recovery
+        return self._report(
+            **measured, step_fraction=fraction, constraint_active=solution.constraint_active
+        )
+
+    def _surrogate_loss(self, tensordict: TensorDictBase) -> Tensor:
+        losses = self.loss_module(tensordict)
+        return losses["loss_objective"] + losses.get("loss_entropy", 0.0)
+
+    def _cost_surrogate(self, tensordict: TensorDictBase) -> Tensor:
+        return self.loss_module.cost_surrogate_loss(tensordict).squeeze(0)
+
+    def _checked_gradient(self, surrogate: Tensor, name: str) -> Tensor:
+        gradient = flat_gradient(surrogate, actor_parameters(self.loss_module))
+        if not gradient.isfinite().all():
+            raise ValueError(
+                f"The gradient of the {name} surrogate is not finite; the surrogate is "
+                f"{surrogate.item()}. Look for NaN in the advantages, observations and actor."
+            )
+        return gradient
+
+    def _mean_kl(
+        self, fixed: Distribution, distribution: Distribution, tensordict: TensorDictBase
+    ) -> Tensor:
+        # Reduced as the surrogates are, so that masked steps count in neither.
+        return self.loss_module._reduce_loss(
+            divergence(fixed, distribution).unsqueeze(-1), tensordict
+        )
+
+    def _report(self, **numbers: float | Tensor) -> TensorDict:
+        counts = {name: getattr(self, name) for name in _COUNTS}
+        numbers = {**dict.fromkeys(_NUMBERS, 0.0), **numbers, **counts}
+        return TensorDict({name: torch.as_tensor(value) for name, value in numbers.items()})
+
+
+_NUMBERS = ("kl", "surrogate_gain", "cost_surrogate_change", "step_fraction", "constraint_active")
+_COUNTS = ("rejected_steps", "indefinite_steps", "recovery_steps")
+
+
+def _check_loss(loss: PPOLoss, method: TrustRegionMethod) -> None:
+    if not isinstance(loss, PPOLoss) or isinstance(loss, ClipPPOLoss | KLPENPPOLoss):
+        raise ValueError(
+            f"loss_module must be a PPOLoss without clipping or penalty, got {type(loss).__name__}."
+        )
+    if loss.reduction != "mean":
+        raise ValueError(f"loss_module must have reduction='mean', got {loss.reduction!r}.")
+    if not actor_parameters(loss):
+        raise ValueError("The actor of loss_module has no trainable parameter.")
+    if not method.constrained:
+        return
+    if not isinstance(loss, TrustRegionLoss):
+        raise ValueError(
+            f"{method} needs a TrustRegionLoss, which has a cost critic, got {type(loss).__name__}."
+        )
+    if loss.num_costs != 1:
+        raise ValueError(
+            f"{method} limits one cost, in closed form, but loss_module has "
+            f"{loss.num_costs}. Add them up, or use TRPO with multipliers."
+        )
