@@ -69,29 +69,32 @@ def finish(loss):
     return loss
 
 
-def make_loss(kind, num_costs=1, seed=0, **kwargs):
+def make_parent(kind, seed=0, **options):
     torch.manual_seed(seed)
-    actor, critic = make_actor(kind), make_critic()
-    options = {"num_costs": num_costs, **OWN[kind], **kwargs}
-    # The networks that the parent has too are drawn first, so that they are the same.
-    reference = PARENTS[kind](
-        actor, critic, **{key: options[key] for key in options if key not in ADDED}
+    return finish(PARENTS[kind](make_actor(kind), make_critic(), **{**OWN[kind], **options}))
+
+
+def make_loss(kind, num_costs=1, seed=0, num_cost_qvalue_nets=2, multiplier_init=0.0, **options):
+    """A loss whose actor and reward critics are those of the parent with this seed."""
+    torch.manual_seed(seed)
+    actor, critic, cost_critic = make_actor(kind), make_critic(), make_cost_critic(num_costs)
+    loss = kind(
+        actor,
+        critic,
+        cost_critic,
+        num_costs=num_costs,
+        num_cost_qvalue_nets=num_cost_qvalue_nets,
+        multiplier_init=multiplier_init,
+        **{**OWN[kind], **options},
     )
-    loss = kind(actor, critic, make_cost_critic(num_costs), **options)
-    for network in networks(reference):
-        for ours, theirs in zip(
-            parameters(loss, network), parameters(reference, network), strict=True
-        ):
-            ours.data.copy_(theirs.data)
-    return finish(loss)
-
-
-ADDED = ("num_costs", "num_cost_qvalue_nets", "multiplier_init")
-
-
-def make_parent(kind, seed=0, **kwargs):
     torch.manual_seed(seed)
-    return finish(PARENTS[kind](make_actor(kind), make_critic(), **{**OWN[kind], **kwargs}))
+    reference = PARENTS[kind](make_actor(kind), make_critic(), **{**OWN[kind], **options})
+    with torch.no_grad():
+        for network in networks(reference):
+            pairs = zip(parameters(loss, network), parameters(reference, network), strict=True)
+            for ours, theirs in pairs:
+                ours.copy_(theirs)
+    return finish(loss)
 
 
 def make_batch(num_costs=1, rows=12, seed=1):
