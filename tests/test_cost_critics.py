@@ -81,7 +81,7 @@ def networks_with_gradient(loss):
 
 def assert_same_outputs(actual, expected):
     """Every output of ``expected`` is in ``actual``, bit for bit."""
-    for key in expected.keys():  # Items would come wrapped where they are no tensors.
+    for key in list(expected.keys()):  # Items would come wrapped where they are no tensors.
         assert torch.equal(actual[key], expected[key]), key
 
 
@@ -204,7 +204,7 @@ def test_discount_of_the_costs_acts_on_the_costs_alone(kind):
     assert loss.cost_value_estimator.gamma.item() == pytest.approx(0.99)
     loss.make_cost_value_estimator(gamma=0.5)
     after = call(loss, batch)
-    changed = {key for key in before.keys() if not torch.equal(before[key], after[key])}
+    changed = {key for key, value in before.items() if not torch.equal(value, after[key])}
     assert changed == {"loss_cost_qvalue"}
     loss.make_value_estimator(gamma=0.5)
     last = call(loss, batch)
@@ -222,7 +222,7 @@ def test_an_estimator_can_be_passed(kind):
     assert estimator.tensor_keys.reward == "renamed"
     with pytest.raises(ValueError, match="'gamma'"):
         loss.make_cost_value_estimator(estimator, gamma=0.9)
-    with pytest.raises(TypeError, match="estimator must be a ValueEstimatorBase, got 0.9"):
+    with pytest.raises(TypeError, match=r"estimator must be a ValueEstimatorBase, got 0\.9"):
         loss.make_cost_value_estimator(0.9)
 
 
@@ -233,10 +233,8 @@ def test_the_loss_is_the_sum_over_ensemble_and_costs(kind):
     make_constant(whole, values, torch.zeros(2, 3))
     batch = make_batch(3)
     cost = batch["next", "cost"]
-    expected = sum(
-        smooth_l1_loss(critic.expand_as(cost), cost, reduction="sum") for critic in values
-    )
-    torch.testing.assert_close(whole(batch)["loss_cost_qvalue"], expected)
+    errors = [smooth_l1_loss(critic.expand_as(cost), cost, reduction="sum") for critic in values]
+    torch.testing.assert_close(whole(batch)["loss_cost_qvalue"], sum(errors))
 
 
 @each_loss
