@@ -16,6 +16,7 @@ from torchrl.envs import (
     RewardSum,
     SerialEnv,
     StepCounter,
+    Transform,
     TransformedEnv,
 )
 from torchrl.envs.utils import check_env_specs
@@ -239,9 +240,22 @@ def test_a_reset_of_some_rows_leaves_the_others_alone(make_env, kind):
     key = env.transform[-1].out_key
     following = env.step(env.rand_action(env.reset()))["next"].exclude("reward", "cost")
     following["_reset"] = torch.tensor([[False], [True], [False]])
-    after = env.reset(following)[key].flatten()
+    after = env.reset(following.clone())[
+        key
+    ].flatten()  # It takes the mask out of what it is given.
     start, moved = {"saute": (1.0, 1 - 0.25 / 100), "early": (0.0, 0.25)}[kind]
     assert after.tolist() == pytest.approx([moved, start, moved])
+    # So do the transforms that come next, which see it before reset puts the rows together.
+    seen = []
+
+    class Look(Transform):
+        def _reset(self, tensordict, tensordict_reset):
+            seen.append(tensordict_reset[key].flatten().tolist())
+            return tensordict_reset
+
+    env.append_transform(Look())
+    env.reset(following)
+    assert seen == [pytest.approx([moved, start, moved])]
 
 
 def test_in_a_collector(make_env):

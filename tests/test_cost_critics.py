@@ -19,9 +19,11 @@ from off_policy import (
     networks,
     parameters,
 )
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.utils import unravel_key
 from torch import nn
 from torch.nn.functional import smooth_l1_loss
+from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from torchrl_safe.objectives import (
@@ -306,6 +308,27 @@ def test_each_loss_trains_one_network(kind, name):
     assert {key for key, value in losses.items() if value.requires_grad} == {*TRAINS, *extra}
     losses[name].backward()
     assert networks_with_gradient(loss) == {TRAINS[name]}
+
+
+@pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
+@each_loss
+def test_separate_losses_freeze_what_the_cost_critics_share_with_the_actor(kind, separate):
+    actor, critic = make_actor(kind), make_critic()
+    shared = next(module for module in actor.modules() if isinstance(module, nn.Linear))
+    encoder = TensorDictModule(shared, ["observation"], ["hidden"])
+    head = nn.Linear(shared.out_features, 2)
+    head = ValueOperator(head, in_keys=["hidden"], out_keys=["state_action_cost_value"])
+    cost_critic = TensorDictSequential(encoder, head)
+    loss = kind(actor, critic, cost_critic, num_costs=2, separate_losses=separate, **OWN[kind])
+    SoftUpdate(loss, tau=0.5)
+    params = loss.cost_qvalue_network_params["module"]
+    assert params["0", "module", "weight"].requires_grad == (not separate)
+    assert params["1", "module", "weight"].requires_grad
+    # Frozen, the ensemble reads what the actor has; else each member has a layer of its own.
+    assert torch.equal(params["0", "module", "weight"][0], shared.weight) == separate
+    loss(make_batch(2))["loss_cost_qvalue"].backward()
+    assert params["1", "module", "weight"].grad.abs().sum() > 0
+    assert all(p.grad is None for p in parameters(loss, "actor"))
 
 
 # ---------------------------------------------------------------- targets and multipliers

@@ -233,8 +233,9 @@ class CostCriticsMixin(LossModule):
         super()._set_in_keys()
         keys = self._cost_qvalue_in_keys
         actions = self.tensor_keys.action
-        actions = actions if isinstance(actions, list) else [actions]
-        following = (unravel_key(("next", key)) for key in keys if key not in actions)
+        actions = [_as_tuple(key) for key in (actions if isinstance(actions, list) else [actions])]
+        observed = [key for key in keys if not any(_as_tuple(key)[: len(a)] == a for a in actions)]
+        following = [unravel_key(("next", key)) for key in observed]
         keys = [*keys, *following, unravel_key(("next", self.tensor_keys.cost))]
         self._in_keys += [key for key in dict.fromkeys(keys) if key not in self._in_keys]
 
@@ -253,3 +254,7 @@ def _as_list(
     network: TensorDictModuleBase | Sequence[TensorDictModuleBase],
 ) -> list[TensorDictModuleBase] | None:
     return None if isinstance(network, TensorDictModuleBase) else list(network)
+
+
+def _as_tuple(key: NestedKey) -> tuple[str, ...]:
+    return key if isinstance(key, tuple) else (key,)
