@@ -98,10 +98,13 @@ class CostTally(Transform, abc.ABC):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        tally = self._tally_spec(self.parent.full_reward_spec).zero() + self.start
-        reset, before = tensordict.get("_reset", None), tensordict.get(self.out_key, None)
-        if reset is not None and before is not None:
-            tally = torch.where(reset, tally, before)
+        reset, tally = tensordict.get("_reset", None), tensordict.get(self.out_key, None)
+        if tally is None:  # All rows begin then; those outside a mask are put back by reset.
+            tally = self._tally_spec(self.parent.full_reward_spec).zero() + self.start
+        elif reset is None:
+            tally = torch.full_like(tally, self.start)
+        else:
+            tally = torch.where(reset, self.start, tally)
         return tensordict_reset.set(self.out_key, tally)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
