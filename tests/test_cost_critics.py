@@ -174,6 +174,30 @@ def test_targets_by_hand(kind):
 
 
 @each_loss
+def test_critics_and_targets_settle_at_the_discounted_cost(kind):
+    """The same transition again and again costs c / (1 - gamma); a terminated one, c."""
+    loss = make_constant(
+        make_loss(kind, 3, loss_function="l2"), torch.zeros(2, 3), torch.zeros(2, 3)
+    ).make_cost_value_estimator(gamma=0.5)
+    batch = make_batch(3, rows=1).expand(8).clone()
+    batch["next", "observation"] = batch["observation"].clone()
+    batch["next", "cost"] = torch.tensor([1.0, 2.0, 0.0]).expand(8, 3)
+    bias = loss.cost_qvalue_network_params["module", "body", "2", "bias"]
+    optimizer, targets = torch.optim.SGD([bias], lr=0.25), SoftUpdate(loss, tau=0.5)
+    for terminated, expected in ((False, [2.0, 4.0, 0.0]), (True, [1.0, 2.0, 0.0])):
+        batch["next", "terminated"] = torch.full((8, 1), terminated)
+        batch["next", "done"] = torch.ones(8, 1, dtype=torch.bool)  # Else truncated.
+        for _ in range(50):
+            loss(batch)["loss_cost_qvalue"].backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            targets.step()
+        torch.testing.assert_close(
+            bias.detach(), torch.tensor(expected).expand(2, 3), atol=1e-3, rtol=0
+        )
+
+
+@each_loss
 def test_next_costs_are_those_of_the_action_that_the_reward_is_bootstrapped_with(kind):
     """With costs and rewards alike, and critics alike, the two losses are alike too."""
     loss = make_loss(kind, 1, **NO_ENTROPY[kind])
