@@ -3,6 +3,8 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import MultiStepTransform
 from torchrl.objectives.value import TD0Estimator
 
 from torchrl_safe.objectives import CostTD0
@@ -46,6 +48,35 @@ def test_several_steps_discount_by_their_number():
     batch["steps_to_next_obs"] = torch.tensor([[1], [1], [3]])
     target = CostTD0(gamma=0.5).value_estimate(batch)
     assert target[:, 0].tolist() == [6.0, 1.0, 1.0 + 10 / 8]
+
+
+def test_behind_a_multi_step_transform():
+    """Costs 1 and 2 in every step: three of them, discounted, and the value after the third."""
+    steps = torch.zeros(1, 6, 1)
+    batch = TensorDict(
+        next=TensorDict(
+            observation=steps,
+            reward=steps,
+            cost=torch.tensor([1.0, 2.0]).expand(1, 6, 2),
+            done=steps.bool(),
+            terminated=steps.bool(),
+            batch_size=[1, 6],
+        ),
+        observation=steps,
+        batch_size=[1, 6],
+    )
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(6),
+        transform=MultiStepTransform(3, 0.5, reward_keys=["reward", "cost"]),
+        batch_size=4,
+        dim_extend=0,
+    )
+    for row in batch.unbind(0):
+        buffer.extend(row.unsqueeze(0))
+    sample = buffer.sample().reshape(-1)
+    sample["next", "state_action_cost_value"] = torch.full((len(sample), 2), 8.0)
+    target = CostTD0(gamma=0.5).value_estimate(sample)
+    assert torch.equal(target, torch.tensor([1.75 + 1, 3.5 + 1]).expand(len(sample), 2))
 
 
 def test_a_given_next_value_goes_first():

@@ -90,5 +90,7 @@ class CostTD0(TD0Estimator):
         ):
             signal = tensordict.get(key, None)
             if signal is not None:
+                # MultiStepTransform counts its steps without a last dimension.
+                signal = signal.reshape(*cost.shape[:-1], 1)
                 tensordict.set(key, signal.expand_as(cost))
         return super().value_estimate(tensordict, next_value=next_value, **kwargs)
