@@ -23,6 +23,7 @@ from torchrl_safe.envs.costs import (
     SpeedAndSeparation,
     Workspace,
 )
+from torchrl_safe.envs.early_termination import EarlyTermination
 from torchrl_safe.envs.human import Human
 from torchrl_safe.envs.kinematics import (
     BulletInverseKinematics,
@@ -34,6 +35,7 @@ from torchrl_safe.envs.observations import FullObservation, paper_observation
 from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placement, Scattered
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, paper_env
 from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.saute import Saute
 from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
@@ -64,6 +66,7 @@ __all__ = [
     "CostToReward",
     "Cylinder",
     "DampedLeastSquares",
+    "EarlyTermination",
     "FullObservation",
     "Gripper",
     "Human",
@@ -82,6 +85,7 @@ __all__ = [
     "Push",
     "Reach",
     "Region",
+    "Saute",
     "Scattered",
     "Scene",
     "Sensing",

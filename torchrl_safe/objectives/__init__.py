@@ -1,6 +1,7 @@
 """Constrained losses and the rules that move their multipliers. Needs TorchRL only."""
 
 from torchrl_safe.objectives.cost_gae import CostGAE
+from torchrl_safe.objectives.cost_td0 import CostTD0
 from torchrl_safe.objectives.crpo import CRPOLoss
 from torchrl_safe.objectives.cup import CUPLoss
 from torchrl_safe.objectives.focops import FOCOPSLoss
@@ -11,6 +12,8 @@ from torchrl_safe.objectives.multipliers import DualAscent, MultiplierUpdater
 from torchrl_safe.objectives.p3o import P3OLoss
 from torchrl_safe.objectives.pid_control import PIDControl
 from torchrl_safe.objectives.ppo_lagrangian import PPOLagrangianLoss
+from torchrl_safe.objectives.sac_lagrangian import SACLagrangianLoss
+from torchrl_safe.objectives.td3_lagrangian import TD3LagrangianLoss
 from torchrl_safe.objectives.trust_region_loss import TrustRegionLoss
 from torchrl_safe.objectives.trust_region_methods import CPO, PCPO, TRPO, TrustRegionMethod
 from torchrl_safe.objectives.trust_region_step import TrustRegionStep
@@ -23,6 +26,7 @@ __all__ = [
     "CRPOLoss",
     "CUPLoss",
     "CostGAE",
+    "CostTD0",
     "DualAscent",
     "FOCOPSLoss",
     "IPOLoss",
@@ -31,6 +35,8 @@ __all__ = [
     "P3OLoss",
     "PIDControl",
     "PPOLagrangianLoss",
+    "SACLagrangianLoss",
+    "TD3LagrangianLoss",
     "TrustRegionLoss",
     "TrustRegionMethod",
     "TrustRegionStep",

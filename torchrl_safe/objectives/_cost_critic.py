@@ -77,8 +77,8 @@ class CostCriticMixin(LossModule):
             self.target_cost_critic_network_params = None
         device = _get_default_device(self) if device is None else device
         self.register_coeff_buffer("cost_critic_coeff", cost_critic_coeff, device=device)
-        self.register_state_dict_pre_hook(_build_value_estimators)
-        self.register_load_state_dict_pre_hook(_build_value_estimators)
+        self.register_state_dict_pre_hook(build_value_estimators)
+        self.register_load_state_dict_pre_hook(build_value_estimators)
 
     def make_cost_value_estimator(
         self: Self, estimator: ValueEstimatorBase | None = None, **hyperparams: Any
@@ -265,6 +265,6 @@ def get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     return tensor
 
 
-def _build_value_estimators(loss: CostCriticMixin, *_: Any) -> None:
+def build_value_estimators(loss: CostCriticMixin, *_: Any) -> None:
     # Their buffers are part of the state: a fresh and a used loss then have the same entries.
     _ = loss.value_estimator, loss.cost_value_estimator

@@ -28,7 +28,7 @@ class LagrangeMultiplierMixin(CostCriticMixin):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, num_costs=num_costs, **kwargs)
-        multiplier = _initial_multiplier(num_costs, multiplier_init)
+        multiplier = initial_multiplier(num_costs, multiplier_init)
         self.register_buffer("lagrange_multiplier", multiplier.to(self.cost_critic_coeff.device))
 
     def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
@@ -59,7 +59,7 @@ class MixedAdvantageMixin(LagrangeMultiplierMixin):
         return self._mix(advantage, tensordict.get(self.tensor_keys.cost_advantage))
 
 
-def _initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:
+def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:
     multiplier = torch.as_tensor(multiplier_init, dtype=torch.get_default_dtype())
     if multiplier.shape not in ((), (num_costs,)):
         raise ValueError(

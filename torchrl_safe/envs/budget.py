@@ -1,0 +1,124 @@
+"""What transforms with a safety budget share: a tally of the costs of an episode."""
+
+from __future__ import annotations
+
+import abc
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+
+class CostTally(Transform, abc.ABC):
+    """Keeps one number for each of k costs from step to step, as an observation of its own.
+
+    The number lives in the tensordict, as the sums of :class:`~torchrl.envs.RewardSum` do: a
+    partial reset starts it anew in the rows that it resets, and in those only, in batched and in
+    parallel environments.
+
+    Args:
+        budget (float or Tensor): what the costs of an episode may sum up to, one number or k.
+        start (float): the number that an episode begins with.
+        cost_key (NestedKey): the costs, among the rewards, shape ``(*batch, k)``.
+        reward_key (NestedKey): the reward that changes, shape ``(*batch, 1)``.
+        out_key (NestedKey): where the number is written, shape ``(*batch, k)``.
+    """
+
+    budget: Tensor
+
+    def __init__(
+        self,
+        budget: float | Tensor,
+        *,
+        start: float,
+        cost_key: NestedKey,
+        reward_key: NestedKey,
+        out_key: NestedKey,
+    ) -> None:
+        limit = torch.as_tensor(budget, dtype=torch.get_default_dtype())
+        if limit.ndim > 1 or not limit.isfinite().all() or (limit < 0).any():
+            raise ValueError(
+                "budget must be one number or one for each cost, finite and not negative, got "
+                f"{budget}."
+            )
+        self.cost_key, self.reward_key, self.out_key = map(
+            unravel_key, (cost_key, reward_key, out_key)
+        )
+        super().__init__(in_keys=[self.cost_key], out_keys=[self.out_key])
+        self.start = start
+        self.register_buffer("budget", limit.clone())
+
+    @abc.abstractmethod
+    def advance(self, tally: Tensor, cost: Tensor) -> Tensor:
+        """Returns the number after a step with a cost; all of shape ``(*batch, k)``."""
+
+    @abc.abstractmethod
+    def is_spent(self, tally: Tensor) -> Tensor:
+        """Tells where a budget is exceeded; both of shape ``(*batch, k)``."""
+
+    @abc.abstractmethod
+    def enforce(self, next_tensordict: TensorDictBase, spent: Tensor) -> TensorDictBase:
+        """Changes what a step returns where any budget is exceeded, ``spent`` ``(*batch, 1)``."""
+
+    def _tally_spec(self, rewards: Composite) -> TensorSpec:
+        known = list(rewards.keys(True, True))
+        for name, key in (("cost_key", self.cost_key), ("reward_key", self.reward_key)):
+            if key not in known:
+                raise KeyError(f"{name} must be among the rewards {known}, got {key!r}.")
+        spec = rewards[self.cost_key]
+        if self.budget.shape not in ((), spec.shape[-1:]):
+            raise ValueError(
+                f"budget must be one number or one for each of the {spec.shape[-1]} costs, got "
+                f"shape {tuple(self.budget.shape)}."
+            )
+        return Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        output_spec = output_spec.clone()
+        observations = output_spec["full_observation_spec"]
+        if self.out_key in (known := list(observations.keys(True, True))):
+            raise KeyError(
+                f"out_key must not be among the observations {known}, got {self.out_key!r}."
+            )
+        observations[self.out_key] = self._tally_spec(output_spec["full_reward_spec"])
+        return output_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        # Batched environments hand their workers the entries that are in the state alone.
+        input_spec = input_spec.clone()
+        states = input_spec["full_state_spec"]
+        if states is None:
+            states = Composite(shape=input_spec.shape, device=input_spec.device)
+        states[self.out_key] = self._tally_spec(self.parent.full_reward_spec)
+        input_spec["full_state_spec"] = states
+        return input_spec
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        reset, tally = tensordict.get("_reset", None), tensordict.get(self.out_key, None)
+        if tally is None:  # All rows begin then; those outside a mask are put back by reset.
+            tally = self._tally_spec(self.parent.full_reward_spec).zero() + self.start
+        elif reset is None:
+            tally = torch.full_like(tally, self.start)
+        else:
+            tally = torch.where(reset, self.start, tally)
+        return tensordict_reset.set(self.out_key, tally)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        before = tensordict.get(self.out_key, None)
+        if before is None:
+            raise KeyError(
+                f"{self.out_key!r} must come from the step before, and is missing: a transform "
+                "that uses it must keep it (CatTensors with del_keys=False)."
+            )
+        tally = self.advance(before, next_tensordict.get(self.cost_key))
+        next_tensordict.set(self.out_key, tally)
+        return self.enforce(next_tensordict, self.is_spent(tally).any(-1, keepdim=True))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        raise RuntimeError(
+            f"{type(self).__name__} changes what an environment returns: append it to one."
+        )

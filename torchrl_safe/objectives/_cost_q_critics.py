@@ -1,0 +1,259 @@
+"""What the off-policy Lagrangian losses share: an ensemble of cost critics and multipliers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives import LossModule
+from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
+from torchrl.objectives.value import ValueEstimatorBase
+
+from torchrl_safe.objectives._cost_critic import build_value_estimators, get_or_raise
+from torchrl_safe.objectives._lagrange import initial_multiplier
+from torchrl_safe.objectives.cost_td0 import CostTD0
+from torchrl_safe.objectives.functional import penalized_advantage
+
+
+class CostCriticsMixin(LossModule):
+    """Adds an ensemble of critics of k costs, and their multipliers, to a loss with Q-values.
+
+    To be mixed into TorchRL's :class:`~torchrl.objectives.SACLoss` or
+    :class:`~torchrl.objectives.TD3Loss`, ahead of it. The class that does so
+
+    - leaves the next action that the reward critics are bootstrapped with under ``"next"`` of the
+      tensordict which its value loss is given: the cost critics are bootstrapped with the same;
+    - passes the actor's objective through :meth:`penalized_objective`.
+
+    Arguments, keys and outputs are described in
+    :class:`~torchrl_safe.objectives.SACLagrangianLoss`.
+    """
+
+    _schedulable_buffers = frozenset({"lagrange_multiplier"})
+
+    cost_qvalue_network: TensorDictModule
+    cost_qvalue_network_params: TensorDictParams
+    target_cost_qvalue_network_params: TensorDictParams
+    lagrange_multiplier: Tensor
+    reduction: str
+    deactivate_vmap: bool
+    out_keys: list[NestedKey]
+    _in_keys: list[NestedKey]
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase | Sequence[TensorDictModuleBase],
+        cost_qvalue_network: TensorDictModuleBase | Sequence[TensorDictModuleBase],
+        *,
+        num_costs: int = 1,
+        num_cost_qvalue_nets: int = 2,
+        multiplier_init: float | Tensor = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        if num_costs < 1:
+            raise ValueError(f"num_costs must be at least 1, got {num_costs}.")
+        multiplier = initial_multiplier(num_costs, multiplier_init)
+        networks = _as_list(cost_qvalue_network)
+        if num_cost_qvalue_nets < 1:
+            raise ValueError(
+                f"num_cost_qvalue_nets must be at least 1, got {num_cost_qvalue_nets}."
+            )
+        if networks is not None and len(networks) != num_cost_qvalue_nets:
+            raise ValueError(
+                f"cost_qvalue_network must be one network or num_cost_qvalue_nets = "
+                f"{num_cost_qvalue_nets} of them, got {len(networks)}."
+            )
+        # The parent's constructor already asks for in_keys, before a module can be assigned.
+        self._cost_qvalue_in_keys = list((networks or [cost_qvalue_network])[0].in_keys)
+        self._cost_value_estimator: ValueEstimatorBase | None = None
+        super().__init__(actor_network, qvalue_network, **kwargs)
+        self.convert_to_functional(
+            networks or cost_qvalue_network,
+            "cost_qvalue_network",
+            num_cost_qvalue_nets,
+            create_target_params=self.delay_qvalue,
+            compare_against=(
+                list(actor_network.parameters()) if kwargs.get("separate_losses") else None
+            ),
+        )
+        self.num_cost_qvalue_nets = num_cost_qvalue_nets
+        device = next(self.parameters()).device
+        self.register_buffer("lagrange_multiplier", multiplier.to(device))
+        self.out_keys = [
+            *self.out_keys,
+            "loss_cost_qvalue",
+            *(f"lagrange_multiplier_{index}" for index in range(num_costs)),
+        ]
+        self.register_state_dict_pre_hook(build_value_estimators)
+        self.register_load_state_dict_pre_hook(build_value_estimators)
+
+    def make_cost_value_estimator(
+        self, estimator: ValueEstimatorBase | None = None, **hyperparams: Any
+    ) -> CostCriticsMixin:
+        """Chooses how the cost critics' targets are made.
+
+        Args:
+            estimator (ValueEstimatorBase, optional): an estimator that handles k columns.
+                Defaults to a :class:`~torchrl_safe.objectives.CostTD0`.
+            **hyperparams: arguments of ``CostTD0``, for example ``gamma`` (default ``0.99``).
+                They act on the costs alone; the reward's are those of ``make_value_estimator``.
+
+        Returns:
+            The loss itself.
+
+        Raises:
+            TypeError: if ``estimator`` is no estimator.
+            ValueError: if both an estimator and hyperparameters are given.
+        """
+        if not isinstance(estimator, ValueEstimatorBase | None):
+            raise TypeError(f"estimator must be a ValueEstimatorBase, got {estimator!r}.")
+        if estimator is None:
+            device = self.lagrange_multiplier.device
+            estimator = CostTD0(**{"gamma": 0.99, "device": device, **hyperparams})
+        elif hyperparams:
+            raise ValueError(
+                f"Pass an estimator or hyperparameters, not both: got {estimator} and "
+                f"{sorted(hyperparams)}."
+            )
+        self._cost_value_estimator = estimator
+        self._forward_value_estimator_keys()
+        return self
+
+    @property
+    def cost_value_estimator(self) -> ValueEstimatorBase:
+        """The value estimator of the costs."""
+        if self._cost_value_estimator is None:
+            self.make_cost_value_estimator()
+        return self._cost_value_estimator
+
+    @property
+    @_cache_values
+    def _cached_detached_cost_qvalue_params(self) -> TensorDictParams:
+        return self.cost_qvalue_network_params.detach()
+
+    def _cost_qvalue(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
+        """Values of the N critics for the k costs, shape ``(N, *B, k)``."""
+        ensemble = _vmap_func(
+            self.cost_qvalue_network,
+            (None, 0),
+            randomness=self.vmap_randomness,
+            pseudo_vmap=self.deactivate_vmap,
+        )
+        inputs = tensordict.select(*self._cost_qvalue_in_keys, strict=False)
+        key = self.tensor_keys.state_action_cost_value
+        value = ensemble(inputs, params).get(key, None)
+        if value is None:
+            raise KeyError(f"cost_qvalue_network does not write the key {key!r}.")
+        expected = (*tensordict.batch_size, len(self.lagrange_multiplier))
+        if value.shape[1:] != expected:
+            raise ValueError(
+                f"cost_qvalue_network must write {key!r} of shape {expected}, one column for each "
+                f"cost, got {tuple(value.shape[1:])}."
+            )
+        return value
+
+    def penalized_objective(self, objective: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Mixes the actor's objective with the costs that it is predicted to cause.
+
+        Args:
+            objective (Tensor): what the actor maximizes without costs, shape ``(*B,)``.
+            tensordict (TensorDictBase): inputs of the cost critics with the actor's action.
+
+        Returns:
+            :func:`~torchrl_safe.objectives.penalized_advantage` of the objective and the largest
+            predictions for each cost, shape ``(*B,)``. The critics get no gradient.
+        """
+        cost = self._cost_qvalue(tensordict, self._cached_detached_cost_qvalue_params).max(0)[0]
+        mixed = penalized_advantage(objective.unsqueeze(-1), cost, self.lagrange_multiplier)
+        return mixed.squeeze(-1)
+
+    def cost_qvalue_loss(self, tensordict: TensorDictBase) -> Tensor:
+        """Loss of the cost critics, summed over the ensemble and over the costs.
+
+        Args:
+            tensordict (TensorDictBase): data with the next action under ``"next"``.
+
+        Returns:
+            The loss, reduced.
+        """
+        keys = self.tensor_keys
+        with torch.no_grad():
+            next_value = self._cost_qvalue(
+                tensordict.get("next"), self.target_cost_qvalue_network_params
+            ).max(0)[0]
+            data = tensordict.clone(False)
+            data.set(unravel_key(("next", keys.state_action_cost_value)), next_value)
+            target = self.cost_value_estimator.value_estimate(data)
+        value = self._cost_qvalue(tensordict, self.cost_qvalue_network_params)
+        loss = distance_loss(value, target.expand_as(value), loss_function=self.loss_function)
+        # Summed, not averaged: each critic column then learns as fast with k costs as with one.
+        loss = loss.sum(-1).sum(0)
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        cost_key = unravel_key(("next", self.tensor_keys.cost))
+        cost = get_or_raise(tensordict, cost_key)
+        expected = (*tensordict.batch_size, len(self.lagrange_multiplier))
+        if cost.shape != expected:
+            raise ValueError(
+                f"{cost_key!r} must have shape {expected}, one column for each cost, got "
+                f"{tuple(cost.shape)}."
+            )
+        # The parent leaves the next action in the clone; the priority belongs to the caller.
+        data = tensordict.clone(False)
+        losses = super().forward(data)
+        tensordict.set(self.tensor_keys.priority, data.get(self.tensor_keys.priority))
+        losses.set("loss_cost_qvalue", self.cost_qvalue_loss(data))
+        self._report_multipliers(losses)
+        self._clear_weakrefs(
+            tensordict,
+            data,
+            losses,
+            "cost_qvalue_network_params",
+            "target_cost_qvalue_network_params",
+        )
+        return losses
+
+    def _report_multipliers(self, losses: TensorDictBase) -> None:
+        # One scalar for each cost, since trainers and loggers keep scalars only; cloned, since
+        # the buffer changes in place.
+        for index, multiplier in enumerate(self.lagrange_multiplier.clone().unbind()):
+            losses.set(f"lagrange_multiplier_{index}", multiplier)
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        keys = self._cost_qvalue_in_keys
+        actions = self.tensor_keys.action
+        actions = [_as_tuple(key) for key in (actions if isinstance(actions, list) else [actions])]
+        observed = [key for key in keys if not any(_as_tuple(key)[: len(a)] == a for a in actions)]
+        following = [unravel_key(("next", key)) for key in observed]
+        keys = [*keys, *following, unravel_key(("next", self.tensor_keys.cost))]
+        self._in_keys += [key for key in dict.fromkeys(keys) if key not in self._in_keys]
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        super()._forward_value_estimator_keys(**kwargs)
+        if self._cost_value_estimator is not None:
+            self._cost_value_estimator.set_keys(
+                value=self.tensor_keys.state_action_cost_value,
+                reward=self.tensor_keys.cost,
+                done=self.tensor_keys.done,
+                terminated=self.tensor_keys.terminated,
+            )
+
+
+def _as_list(
+    network: TensorDictModuleBase | Sequence[TensorDictModuleBase],
+) -> list[TensorDictModuleBase] | None:
+    return None if isinstance(network, TensorDictModuleBase) else list(network)
+
+
+def _as_tuple(key: NestedKey) -> tuple[str, ...]:
+    return key if isinstance(key, tuple) else (key,)
