@@ -53,7 +53,7 @@ class Config:
 
 def run(config: Config, action: train.Action, limit: float | None, seed: int) -> dict[str, Any]:
     """Trains and evaluates one policy; without a limit, with PPO."""
-    algorithm = "ppo" if limit is None else "ppo-lagrangian"
+    algorithm: train.AlgorithmName = "ppo" if limit is None else "ppo-lagrangian"
     settings = train.Config(
         paper=config.paper,
         action=action,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
@@ -20,17 +20,16 @@ from typing import Any, Literal
 import torch
 import tyro
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
-from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
-from torchrl.envs import EnvBase, RewardSum, TransformedEnv
-from torchrl.modules import ProbabilisticActor
+from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
+from torchrl.objectives import LossModule
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
-from experiments.agent import make_agent
+from experiments.algorithms import ALGORITHMS
 from experiments.evaluation import evaluate, summarize
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.envs import (
@@ -52,10 +51,28 @@ from torchrl_safe.envs import (
     paper_env,
     paper_observation,
 )
-from torchrl_safe.objectives import DualAscent, MultiplierUpdater, PIDControl
 
 Action = Literal["cartesian", "joint"]
 Observation = Literal["full", "paper"]
+AlgorithmName = Literal[
+    "ppo",
+    "ppo-lagrangian",
+    "kl-ppo-lagrangian",
+    "a2c-lagrangian",
+    "trpo",
+    "trpo-lagrangian",
+    "cpo",
+    "pcpo",
+    "focops",
+    "cup",
+    "p3o",
+    "ipo",
+    "crpo",
+    "ppo-saute",
+    "ppo-early-termination",
+    "sac-lagrangian",
+    "td3-lagrangian",
+]
 MultiplierRule = Literal["dual-ascent", "pid", "fixed"]
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 OBSTACLES: dict[str, Obstacles] = {
@@ -69,14 +86,6 @@ ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointD
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
 COSTS = {"collision": Collision()}
-# Called as rule(loss, rate, cost_limit=, pessimism=, normalize=). The gains stand to each other as
-# in tests/test_constrained_optimum.py.
-MULTIPLIER_RULES: dict[str, Callable[..., MultiplierUpdater]] = {
-    "dual-ascent": lambda loss, rate, **settings: DualAscent(loss, lr=rate, **settings),
-    "pid": lambda loss, rate, **settings: PIDControl(
-        loss, kp=5 * rate, ki=rate, kd=5 * rate, smoothing=0.5, **settings
-    ),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +102,7 @@ class Config:
     """What the policy sees: all that moves, or the paper's eight numbers."""
     paper: bool = False
     """Train in the paper's environment: its Panda, obstacle and actions, at 240 Hz."""
-    algorithms: tuple[Literal["ppo", "ppo-lagrangian"], ...] = ("ppo", "ppo-lagrangian")
+    algorithms: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
     """What to train; ppo is PPO-Lagrangian with its multiplier fixed at 0."""
     cost_limit: float = 0.5
     """Limit of the expected cost of an episode: control steps in which the arm collides."""
@@ -122,6 +131,9 @@ class Config:
     learning_rate: float = 5e-4
     """Adam's learning rate of the policy at the start, half that of the critics; both fall
     linearly to 0."""
+    last_log_std: float = -1.5
+    """Logarithm of the policy's standard deviation at the end, before the squashing; it starts at
+    0 and falls linearly."""
     gamma: float = 0.97
     """Discount of reward and cost."""
     multiplier_rule: MultiplierRule = "dual-ascent"
@@ -158,8 +170,14 @@ class Config:
                 )
 
 
-def make_env(config: Config, num_envs: int, seed: int | None = None) -> EnvBase:
-    """Makes the environment, with the sums of reward and cost over each episode."""
+def make_env(
+    config: Config, num_envs: int, seed: int | None = None, algorithm: AlgorithmName = "ppo"
+) -> EnvBase:
+    """Makes the environment that an algorithm trains in, with sums of reward and cost.
+
+    The sums, over each episode, are of what the arm has earned and cost, whatever an algorithm
+    makes of it.
+    """
     settings: dict[str, Any] = {
         "observation": OBSERVATIONS[config.observation],
         "num_envs": num_envs,
@@ -176,11 +194,13 @@ def make_env(config: Config, num_envs: int, seed: int | None = None) -> EnvBase:
             **settings,
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
-    return TransformedEnv(env, sums)
+    return TransformedEnv(env, Compose(sums, *ALGORITHMS[algorithm].transforms(config)))
 
 
 @contextmanager
-def collecting(config: Config, policy: TensorDictModule) -> Iterator[BaseCollector]:
+def collecting(
+    config: Config, policy: TensorDictModuleBase, algorithm: AlgorithmName
+) -> Iterator[BaseCollector]:
     """Opens TorchRL's collector, in this process or in workers, and shuts it down."""
     settings: dict[str, Any] = {
         "frames_per_batch": config.frames_per_batch,
@@ -188,9 +208,10 @@ def collecting(config: Config, policy: TensorDictModule) -> Iterator[BaseCollect
         "auto_register_policy_transforms": False,
     }
     if config.workers == 1:
-        collector = Collector(make_env(config, config.envs), policy, **settings)
+        env = make_env(config, config.envs, algorithm=algorithm)
+        collector = Collector(env, policy, **settings)
     else:
-        factory = partial(make_env, config, config.envs // config.workers)
+        factory = partial(make_env, config, config.envs // config.workers, algorithm=algorithm)
         collector = MultiSyncCollector([factory] * config.workers, policy, **settings)
     collector.set_seed(config.seed)
     try:
@@ -200,84 +221,51 @@ def collecting(config: Config, policy: TensorDictModule) -> Iterator[BaseCollect
 
 
 def train(
-    config: Config, algorithm: str, *, progress: bool = True
-) -> tuple[ProbabilisticActor, list[dict[str, float]]]:
+    config: Config, algorithm: AlgorithmName, *, progress: bool = True
+) -> tuple[TensorDictModuleBase, list[dict[str, float]]]:
     """Trains with one algorithm; returns the policy and a row of figures for each batch."""
     # TorchRL's notes on each buffer would break up the progress bar.
     torchrl_logger.setLevel("WARNING")
     # The networks are small: more threads than one only wait for each other.
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
-    env = make_env(config, num_envs=8, seed=config.seed)
-    constrained = algorithm == "ppo-lagrangian"
-    multiplier_init = config.multiplier_init if constrained else 0.0
-    actor, loss = make_agent(env, gamma=config.gamma, multiplier_init=multiplier_init)
+    env = make_env(config, num_envs=8, seed=config.seed, algorithm=algorithm)
+    training = ALGORITHMS[algorithm].build(env, config)
     env.close()
-    updater = None
-    if constrained and config.multiplier_rule != "fixed":
-        updater = MULTIPLIER_RULES[config.multiplier_rule](
-            loss,
-            config.multiplier_rate,
-            cost_limit=config.cost_limit,
-            pessimism=config.pessimism,
-            normalize=True,
-        )
-    policy = list(loss.actor_network_params.values(True, True))
-    critics = [*loss.critic_network_params.values(True, True)]
-    critics += loss.cost_critic_network_params.values(True, True)
-    optimizer = torch.optim.Adam(
-        [
-            {"params": policy, "lr": config.learning_rate},
-            {"params": critics, "lr": 2 * config.learning_rate},
-        ]
-    )
-    batches = math.ceil(config.frames / config.frames_per_batch)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=batches)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(config.frames_per_batch),
-        sampler=SamplerWithoutReplacement(),
-        batch_size=config.minibatch,
-    )
     logger = get_logger(config.logger, str(config.out / "logs"), algorithm)
     history, frames = [], 0
     with (
-        collecting(config, actor) as collector,
+        collecting(config, training.collector, algorithm) as collector,
         tqdm(
             total=config.frames, desc=algorithm, unit="frame", unit_scale=True, disable=not progress
         ) as bar,
     ):
         for batch in collector:
             episodes = batch["next"][batch["next", "done"].squeeze(-1)]
-            if updater is not None:
-                updater.step(episodes["episode_cost"])
-            buffer.extend(loss.estimate_advantages(batch).reshape(-1))
-            for _ in range(config.epochs):
-                for minibatch in buffer:
-                    losses = loss(minibatch)
-                    sum(v for k, v in losses.items() if k.startswith("loss_")).backward()
-                    torch.nn.utils.clip_grad_norm_(policy, 0.5)
-                    optimizer.step()
-                    optimizer.zero_grad()
-            schedule.step()
+            if training.updater is not None:
+                training.updater.step(episodes["episode_cost"])
+            training.learner.learn(batch)
             collector.update_policy_weights_()
             frames += batch.numel()
             bar.update(batch.numel())
-            row = figures(episodes, loss.lagrange_multiplier)
+            row = figures(episodes, training.loss)
             bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
             logger.log_metrics(row, step=frames)
             history.append({"frames": frames, **row})
-    state = {"loss": loss, "optimizer": optimizer, "schedule": schedule}
-    if updater is not None:
-        state["updater"] = updater
+    state = training.learner.state()
+    if training.updater is not None:
+        state["updater"] = training.updater
     Checkpoint(**state).save(config.out / algorithm / "checkpoint")
-    return actor, history
+    return training.actor, history
 
 
-def figures(episodes: TensorDictBase, multiplier: torch.Tensor) -> dict[str, float]:
+def figures(episodes: TensorDictBase, loss: LossModule) -> dict[str, float]:
     """Means over the episodes that ended in a batch (none if no episode did), and multipliers."""
-    multipliers = {
-        f"multiplier/{name}": value for name, value in zip(COSTS, multiplier.tolist(), strict=True)
-    }
+    buffers = dict(loss.named_buffers())
+    multipliers = {}
+    if "lagrange_multiplier" in buffers:
+        values = buffers["lagrange_multiplier"].tolist()
+        multipliers = {f"multiplier/{n}": value for n, value in zip(COSTS, values, strict=True)}
     if not len(episodes):
         return multipliers
     costs = episodes["episode_cost"].mean(0).tolist()
@@ -290,13 +278,13 @@ def figures(episodes: TensorDictBase, multiplier: torch.Tensor) -> dict[str, flo
 
 
 def train_and_evaluate(
-    config: Config, algorithm: str, *, progress: bool = True
-) -> tuple[ProbabilisticActor, dict[str, Any]]:
+    config: Config, algorithm: AlgorithmName, *, progress: bool = True
+) -> tuple[TensorDictModuleBase, dict[str, Any]]:
     """Trains with one algorithm and plays with what it has learnt; returns policy and results."""
     start = perf_counter()
     actor, history = train(config, algorithm, progress=progress)
     seconds = perf_counter() - start
-    env = make_env(config, num_envs=32)
+    env = make_env(config, num_envs=32, algorithm=algorithm)
     # Seeds that training does not use.
     episodes = evaluate(env, actor, config.eval_episodes, seed=config.seed + 1_000_000)
     env.close()
@@ -318,13 +306,13 @@ def main(config: Config) -> None:
         "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
         "algorithms": {},
     }
-    stage = make_env(config, num_envs=1, seed=config.seed)
-    save_picture(stage, config.out / "scene.png")
     for algorithm in config.algorithms:
         actor, results["algorithms"][algorithm] = train_and_evaluate(config, algorithm)
+        stage = make_env(config, num_envs=1, seed=config.seed, algorithm=algorithm)
+        save_picture(stage, config.out / "scene.png")
         save_animation(stage, actor, config.out / algorithm / "policy.gif")
+        stage.close()
         (config.out / "results.json").write_text(json.dumps(results, indent=1, default=str))
-    stage.close()
     plot_curves(results, config.out / "curves.png")
     text = table(results)
     (config.out / "table.md").write_text(text)

@@ -1,0 +1,250 @@
+"""The algorithms of ``make train`` by name: what differs from one to the next, and no more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torchrl.envs import CatTensors, EnvBase, Transform
+from torchrl.modules import AdditiveGaussianModule
+from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, LossModule, ValueEstimators
+
+from experiments.agent import make_agent, make_q_agent
+from experiments.learners import Learner, NoiseSchedule, OnPolicyLearner, ReplayLearner
+from torchrl_safe.envs import EarlyTermination, Saute
+from torchrl_safe.objectives import (
+    CPO,
+    PCPO,
+    TRPO,
+    CRPOLoss,
+    CUPLoss,
+    DualAscent,
+    FOCOPSLoss,
+    IPOLoss,
+    LagrangianLoss,
+    MultiplierUpdater,
+    P3OLoss,
+    PIDControl,
+    PPOLagrangianLoss,
+    SACLagrangianLoss,
+    TD3LagrangianLoss,
+    TrustRegionLoss,
+    TrustRegionMethod,
+    TrustRegionStep,
+    ViolationUpdater,
+)
+
+if TYPE_CHECKING:
+    from experiments.train import Config
+
+Updater = MultiplierUpdater | ViolationUpdater
+# Called as rule(loss, rate, cost_limit=, pessimism=, normalize=). The gains stand to each other
+# as in tests/test_constrained_optimum.py.
+MULTIPLIER_RULES: dict[str, Callable[..., MultiplierUpdater]] = {
+    "dual-ascent": lambda loss, rate, **settings: DualAscent(loss, lr=rate, **settings),
+    "pid": lambda loss, rate, **settings: PIDControl(
+        loss, kp=5 * rate, ki=rate, kd=5 * rate, smoothing=0.5, **settings
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training run is made of.
+
+    Args:
+        actor: the policy.
+        collector: the policy that collects, which may add noise of its own.
+        loss: the loss.
+        updater: what tells the loss of the batch's episode costs.
+        learner: what learns from each batch.
+    """
+
+    actor: TensorDictModuleBase
+    collector: TensorDictModuleBase
+    loss: LossModule
+    updater: Updater | None
+    learner: Learner
+
+
+def keep_multiplier(loss: LossModule, config: Config) -> None:
+    """No rule: the multiplier stays where it starts."""
+
+
+def move_multiplier(loss: LossModule, config: Config) -> Updater | None:
+    """The multiplier rule that was chosen."""
+    if config.multiplier_rule == "fixed":
+        return None
+    return MULTIPLIER_RULES[config.multiplier_rule](
+        loss,
+        config.multiplier_rate,
+        cost_limit=config.cost_limit,
+        pessimism=config.pessimism,
+        normalize=True,
+    )
+
+
+def tell_violation(loss: LossModule, config: Config) -> Updater:
+    """No multiplier: the loss reads the violation itself."""
+    return ViolationUpdater(loss, cost_limit=config.cost_limit, pessimism=config.pessimism)
+
+
+def no_transforms(config: Config) -> list[Transform]:
+    """The environment as it is."""
+    return []
+
+
+@dataclass(frozen=True)
+class OnPolicy:
+    """An algorithm that learns from each batch while it is fresh.
+
+    Args:
+        loss: called as ``loss(actor, critic, cost_critic, num_costs=)``.
+        updater: called as ``updater(loss, config)``.
+        epochs: passes over a batch, if not those of the configuration.
+        method: the step that a trust-region method takes with the actor.
+        projects: whether each batch has a second phase, CUP's projection.
+        transforms: called as ``transforms(config)``, what is appended to the environment.
+    """
+
+    loss: Callable[..., LossModule]
+    updater: Callable[[LossModule, Config], Updater | None] = move_multiplier
+    epochs: int | None = None
+    method: TrustRegionMethod | None = None
+    projects: bool = False
+    transforms: Callable[[Config], list[Transform]] = no_transforms
+
+    def build(self, env: EnvBase, config: Config) -> Training:
+        """Makes networks, loss, updater and learner."""
+        agent = make_agent(env, gamma=config.gamma)
+        loss = self.loss(agent.actor, agent.critic, agent.cost_critic, num_costs=_num_costs(env))
+        discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
+        loss.make_value_estimator(ValueEstimators.GAE, **discount)
+        loss.make_cost_value_estimator(**discount)
+        _start_multiplier(loss, self.updater, config)
+        batches = math.ceil(config.frames / config.frames_per_batch)
+        step = None if self.method is None else TrustRegionStep(loss, self.method, max_kl=0.02)
+        phases = []
+        if self.projects:
+            phases = [(None, loss), (loss.start_projection, loss.projection_loss)]
+        learner = OnPolicyLearner(
+            loss,
+            agent.actor,
+            NoiseSchedule(agent.log_std, last=config.last_log_std, batches=batches),
+            learning_rate=config.learning_rate,
+            batches=batches,
+            epochs=self.epochs or config.epochs,
+            frames=config.frames_per_batch,
+            minibatch=config.minibatch,
+            phases=phases,
+            actor_step=step,
+        )
+        return Training(agent.actor, agent.actor, loss, self.updater(loss, config), learner)
+
+
+@dataclass(frozen=True)
+class OffPolicy:
+    """An algorithm that learns from all it has ever seen.
+
+    Args:
+        loss: called as ``loss(actor, critic, cost_critic, num_costs=, action_spec=)``.
+        stochastic: whether the policy is a distribution; else noise is added to collect.
+    """
+
+    loss: Callable[..., LossModule]
+    stochastic: bool
+    updater: Callable[[LossModule, Config], Updater | None] = move_multiplier
+    transforms: Callable[[Config], list[Transform]] = no_transforms
+
+    def build(self, env: EnvBase, config: Config) -> Training:
+        """Makes networks, loss, updater and learner."""
+        agent = make_q_agent(env, gamma=config.gamma, stochastic=self.stochastic)
+        spec = env.action_spec_unbatched
+        loss = self.loss(
+            agent.actor,
+            agent.critic,
+            agent.cost_critic,
+            num_costs=_num_costs(env),
+            action_spec=spec,
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
+        loss.make_cost_value_estimator(gamma=config.gamma)
+        _start_multiplier(loss, self.updater, config)
+        collector = agent.actor
+        if not self.stochastic:
+            noise = AdditiveGaussianModule(spec, sigma_init=0.3, sigma_end=0.3)
+            collector = TensorDictSequential(agent.actor, noise)
+        learner = ReplayLearner(
+            loss,
+            agent.actor,
+            learning_rate=2 * config.learning_rate,
+            capacity=config.frames,
+            minibatch=config.minibatch,
+            steps_per_update=8,
+        )
+        return Training(agent.actor, collector, loss, self.updater(loss, config), learner)
+
+
+Algorithm = OnPolicy | OffPolicy
+
+
+def _wrapping(make: Callable[..., LossModule], parent: Callable[..., LossModule]) -> Any:
+    """``make`` around TorchRL's loss ``parent``, as a function of actor and critics."""
+
+    def build(actor: Any, critic: Any, cost_critic: Any, *, num_costs: int) -> LossModule:
+        wrapped = parent(actor, critic, entropy_bonus=False, loss_critic_type="l2")
+        return make(wrapped, cost_critic, num_costs=num_costs)
+
+    return build
+
+
+def _of_ppo(make: Callable[..., LossModule]) -> Any:
+    """``make`` with the options of PPO that all these runs have."""
+    return partial(make, entropy_bonus=False, loss_critic_type="l2")
+
+
+def _with_budget(config: Config) -> list[Transform]:
+    # The reward of a step is around -1 and better.
+    saute = Saute(config.cost_limit, unsafe_reward=-2.0)
+    return [saute, CatTensors(["observation", "remaining_budget"], "observation")]
+
+
+def _terminating(config: Config) -> list[Transform]:
+    # Worse than any episode, or an early end would be a way out.
+    return [EarlyTermination(config.cost_limit, termination_reward=-20.0)]
+
+
+ALGORITHMS: dict[str, Algorithm] = {
+    "ppo": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier),
+    "ppo-lagrangian": OnPolicy(_of_ppo(PPOLagrangianLoss)),
+    "kl-ppo-lagrangian": OnPolicy(_wrapping(LagrangianLoss, KLPENPPOLoss)),
+    "a2c-lagrangian": OnPolicy(_wrapping(LagrangianLoss, A2CLoss), epochs=1),
+    "trpo": OnPolicy(_of_ppo(TrustRegionLoss), keep_multiplier, method=TRPO()),
+    "trpo-lagrangian": OnPolicy(_of_ppo(TrustRegionLoss), method=TRPO()),
+    "cpo": OnPolicy(_of_ppo(TrustRegionLoss), tell_violation, method=CPO()),
+    "pcpo": OnPolicy(_of_ppo(TrustRegionLoss), tell_violation, method=PCPO()),
+    "focops": OnPolicy(_of_ppo(FOCOPSLoss)),
+    "cup": OnPolicy(_of_ppo(CUPLoss), projects=True),
+    "p3o": OnPolicy(_of_ppo(P3OLoss), tell_violation),
+    "ipo": OnPolicy(_of_ppo(IPOLoss), tell_violation),
+    "crpo": OnPolicy(_wrapping(CRPOLoss, ClipPPOLoss), tell_violation),
+    "ppo-saute": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, transforms=_with_budget),
+    "ppo-early-termination": OnPolicy(
+        _of_ppo(PPOLagrangianLoss), keep_multiplier, transforms=_terminating
+    ),
+    "sac-lagrangian": OffPolicy(SACLagrangianLoss, stochastic=True),
+    "td3-lagrangian": OffPolicy(TD3LagrangianLoss, stochastic=False),
+}
+
+
+def _num_costs(env: EnvBase) -> int:
+    return env.reward_spec["cost"].shape[-1]
+
+
+def _start_multiplier(loss: LossModule, updater: Any, config: Config) -> None:
+    if updater is move_multiplier:
+        loss.lagrange_multiplier.fill_(config.multiplier_init)

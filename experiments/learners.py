@@ -1,0 +1,184 @@
+"""What is done with each collected batch: learning on policy, in a trust region, from replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import (
+    LazyTensorStorage,
+    RandomSampler,
+    SamplerWithoutReplacement,
+    TensorDictReplayBuffer,
+)
+from torchrl.objectives import LossModule, SoftUpdate
+
+from torchrl_safe.objectives import TrustRegionStep
+
+Loss = Callable[[TensorDictBase], TensorDictBase]
+
+
+class Learner(Protocol):
+    """Learns from one collected batch after the other."""
+
+    def learn(self, batch: TensorDictBase) -> None:
+        """Learns from a batch as a collector returns it."""
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+
+
+class NoiseSchedule:
+    """Lowers the standard deviation of a policy from batch to batch, geometrically.
+
+    What is measured while training is then, in the end, the policy that is deployed without
+    noise: its cost too, which a constraint is about.
+
+    Args:
+        log_std: logarithm of the standard deviation; changed in place.
+        last: its value after all batches.
+        batches: how many batches there will be.
+    """
+
+    def __init__(self, log_std: torch.nn.Parameter, *, last: float, batches: int) -> None:
+        self.log_std, self.last, self.batches = log_std.requires_grad_(False), last, batches
+        self.first, self.steps = log_std.clone(), 0
+
+    def step(self) -> None:
+        self.steps += 1
+        self.log_std.copy_(self.first.lerp(torch.tensor(self.last), self.steps / self.batches))
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"first": self.first, "steps": self.steps}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.first, self.steps = state_dict["first"], state_dict["steps"]
+
+
+class OnPolicyLearner:
+    """Goes through each batch some times in minibatches, then forgets it.
+
+    Args:
+        loss: an on-policy loss with ``estimate_advantages``.
+        actor: the policy in it.
+        noise: lowers the noise of the policy after each batch.
+        learning_rate: Adam's, of the policy; that of the critics is twice as high, and both fall
+            linearly to 0 over ``batches``.
+        batches: how many batches there will be.
+        epochs: passes over each batch, in each phase.
+        frames: control steps in a batch.
+        minibatch: control steps in a minibatch.
+        phases: what is minimized, one after the other, each with what is to be done before.
+        actor_step: moves the actor instead of the optimizer.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        actor: TensorDictModuleBase,
+        noise: NoiseSchedule,
+        *,
+        learning_rate: float,
+        batches: int,
+        epochs: int,
+        frames: int,
+        minibatch: int,
+        phases: Sequence[tuple[Callable[[], None] | None, Loss]] = (),
+        actor_step: TrustRegionStep | None = None,
+    ) -> None:
+        self.loss, self.noise, self.epochs, self.actor_step = loss, noise, epochs, actor_step
+        self.phases = phases or [(None, loss)]
+        self.policy = list(actor.parameters())
+        moved_here = {id(parameter) for parameter in self.policy}
+        critics = [p for p in loss.parameters() if id(p) not in moved_here]
+        groups = [{"params": critics, "lr": 2 * learning_rate}]
+        if actor_step is None:
+            groups.append({"params": self.policy, "lr": learning_rate})
+        self.optimizer = torch.optim.Adam(groups)
+        self.schedule = torch.optim.lr_scheduler.LinearLR(
+            self.optimizer, 1.0, 0.0, total_iters=batches
+        )
+        self.buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(frames),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=minibatch,
+        )
+
+    def learn(self, batch: TensorDictBase) -> None:
+        data = self.loss.estimate_advantages(batch).reshape(-1)
+        if self.actor_step is not None:
+            self.actor_step.step(data)
+        self.buffer.extend(data)
+        for prepare, loss in self.phases:
+            if prepare is not None:
+                prepare()
+            for _ in range(self.epochs):
+                for minibatch in self.buffer:
+                    _descend(loss, minibatch, self.optimizer, self.policy)
+        self.schedule.step()
+        self.noise.step()
+
+    def state(self) -> dict[str, Any]:
+        state = {
+            "loss": self.loss,
+            "optimizer": self.optimizer,
+            "schedule": self.schedule,
+            "noise": self.noise,
+        }
+        return state if self.actor_step is None else {**state, "actor_step": self.actor_step}
+
+
+class ReplayLearner:
+    """Keeps all batches and takes gradient steps on samples of them.
+
+    Args:
+        loss: an off-policy loss with target networks.
+        actor: the policy in it.
+        learning_rate: Adam's, of all networks.
+        capacity: control steps to keep.
+        minibatch: control steps in a sample.
+        steps_per_update: collected control steps for each gradient step.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        actor: TensorDictModuleBase,
+        *,
+        learning_rate: float,
+        capacity: int,
+        minibatch: int,
+        steps_per_update: int,
+    ) -> None:
+        self.loss, self.steps_per_update = loss, steps_per_update
+        self.targets = SoftUpdate(loss, tau=0.005)
+        self.policy = list(actor.parameters())
+        self.optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate)
+        self.buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(capacity), sampler=RandomSampler(), batch_size=minibatch
+        )
+
+    def learn(self, batch: TensorDictBase) -> None:
+        self.buffer.extend(batch.reshape(-1))
+        for _ in range(batch.numel() // self.steps_per_update):
+            _descend(self.loss, self.buffer.sample(), self.optimizer, self.policy)
+            self.targets.step()
+
+    def state(self) -> dict[str, Any]:
+        return {"loss": self.loss, "optimizer": self.optimizer}
+
+
+def _descend(
+    loss: Loss,
+    minibatch: TensorDictBase,
+    optimizer: torch.optim.Optimizer,
+    policy: list[torch.nn.Parameter],
+) -> None:
+    losses = loss(minibatch)
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    torch.nn.utils.clip_grad_norm_(policy, 0.5)
+    optimizer.step()
+    optimizer.zero_grad()
