@@ -5,10 +5,18 @@ from functools import partial
 
 import pytest
 import torch
-from networks import make_batch, make_critic, make_loss, make_networks
+from networks import OBSERVATION, make_batch, make_critic, make_loss, make_networks
+from tensordict.nn import (
+    NormalParamExtractor,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from tensordict.utils import unravel_key
+from torch import nn
 from torch.distributions.transforms import SoftplusTransform
-from torchrl.modules import PopArtValueNorm
+from torchrl.modules import IndependentNormal, PopArtValueNorm, ValueOperator
 from torchrl.objectives import (
     A2CLoss,
     ClipPPOLoss,
@@ -162,6 +170,37 @@ def test_each_network_is_trained_by_its_own_loss(parent):
     reached = {name for name, p in loss.named_parameters() if p.grad is not None and p.grad.any()}
     assert reached
     assert all(name.startswith("cost_critic_network") for name in reached)
+
+
+@pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
+@pytest.mark.parametrize("parent", [A2CLoss, ClipPPOLoss])
+def test_only_the_policy_trains_a_shared_trunk_with_separate_losses(parent, separate):
+    torch.manual_seed(0)
+    trunk = TensorDictModule(nn.Linear(OBSERVATION, 8), ["observation"], ["hidden"])
+    policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
+    actor = ProbabilisticTensorDictSequential(
+        trunk,
+        TensorDictModule(policy, ["hidden"], ["loc", "scale"]),
+        ProbabilisticTensorDictModule(
+            in_keys=["loc", "scale"],
+            out_keys=["action"],
+            distribution_class=IndependentNormal,
+            return_log_prob=True,
+        ),
+    )
+    critic = TensorDictSequential(trunk, ValueOperator(nn.Linear(8, 1), in_keys=["hidden"]))
+    cost_critic = TensorDictSequential(
+        trunk, ValueOperator(nn.Linear(8, 2), in_keys=["hidden"], out_keys=["cost_value"])
+    )
+    wrapped = parent(actor, critic, separate_losses=separate)
+    loss = LagrangianLoss(wrapped, cost_critic, num_costs=2, separate_losses=separate)
+    assert len({id(p) for p in loss.parameters()}) == len(list(loss.parameters())) == 2 + 3 * 2
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    for key, shared in (("loss_objective", True), ("loss_cost_critic", not separate)):
+        loss.zero_grad()
+        trunk.module.weight.grad = None
+        loss(data)[key].backward()
+        assert (trunk.module.weight.grad is not None) == shared
 
 
 def test_the_wrapper_writes_nothing_into_its_input():

@@ -3,6 +3,7 @@
 import copy
 import math
 import re
+from functools import partial
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from networks import make_loss
 from torch.distributions.transforms import SoftplusTransform
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives import DualAscent, MultiplierUpdater
+from torchrl_safe.objectives import DualAscent, MultiplierUpdater, PIDControl
 
 NAN, INF = float("nan"), float("inf")
 
@@ -117,6 +118,61 @@ def test_a_multiplier_set_by_hand_is_where_the_next_step_starts(optimizer):
     torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([3.5]))
 
 
+# ---------------------------------------------------------------- pessimism and normalization
+
+
+def test_pessimism_adds_standard_errors():
+    # 0 and 2: mean 1, standard deviation sqrt 2, standard error 1. 5 and 5: no error at all.
+    module = make_module(0.0, 0.0)
+    updater = DualAscent(module, cost_limit=1.0, lr=0.5, pessimism=2.0)
+    updater.step(torch.tensor([[0.0, 5.0], [2.0, 5.0]]))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([1.0, 2.0]))
+
+
+def test_pessimism_adds_nothing_to_a_single_episode():
+    module = make_module(0.0)
+    DualAscent(module, cost_limit=1.0, lr=1.0, pessimism=2.0).step(torch.tensor([[3.0]]))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([2.0]))
+
+
+@pytest.mark.parametrize(
+    ("costs", "limit", "pessimism", "expected"),
+    [
+        # Mean 2 of standard deviation sqrt 8.
+        pytest.param([0.0, 4.0], 1.0, 0.0, 1 / (2 * math.sqrt(8)), id="mean-and-deviation"),
+        pytest.param([0.0, 4.0], 1.0, 1.0, 3 / (4 * math.sqrt(8)), id="pessimistic"),
+        pytest.param([1.0, 1.0], 2.0, 0.0, -1 / (2 * 2), id="limit-for-both"),
+        pytest.param([4.0], 1.0, 0.0, 3 / (4 * 4), id="one-episode"),
+        pytest.param([3.0, 3.0], 0.0, 0.0, 3 / (3 * 3), id="limit-zero-no-deviation"),
+        pytest.param([0.0, 0.0], 0.0, 2.0, 0.0, id="nothing-at-all"),
+    ],
+)
+def test_normalized_violation(costs, limit, pessimism, expected):
+    module = make_module(5.0)
+    updater = DualAscent(module, cost_limit=limit, lr=1.0, pessimism=pessimism, normalize=True)
+    updater.step(torch.tensor(costs).unsqueeze(-1))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([5.0 + expected]))
+
+
+@pytest.mark.parametrize(
+    "rule", [partial(DualAscent, lr=0.5), partial(PIDControl, kp=1, ki=1, kd=1)]
+)
+def test_normalized_multipliers_follow_the_unit_of_the_cost(rule):
+    """Grams for kilograms: every multiplier is a thousandth, after every step."""
+    generator = torch.Generator().manual_seed(0)
+    kilograms, grams = make_module(0.0), make_module(0.0)
+    rules = [
+        rule(module, cost_limit=limit, pessimism=1.0, normalize=True)
+        for module, limit in ((kilograms, 2.0), (grams, 2000.0))
+    ]
+    for scale in (8.0, 9.0, 1.0, 0.5, 10.0):
+        costs = scale * torch.rand(6, 1, generator=generator)
+        rules[0].step(costs)
+        rules[1].step(1000 * costs)
+        torch.testing.assert_close(1000 * grams.lagrange_multiplier, kilograms.lagrange_multiplier)
+    assert kilograms.lagrange_multiplier.item() > 0
+
+
 # ---------------------------------------------------------------- what must change nothing
 
 
@@ -185,12 +241,21 @@ def test_a_cost_of_the_wrong_shape_is_refused(adam, shape):
         pytest.param("max_multiplier", 0.0, id="bound-zero"),
         pytest.param("max_multiplier", -1.0, id="bound-negative"),
         pytest.param("max_multiplier", NAN, id="bound-nan"),
+        pytest.param("pessimism", -1.0, id="pessimism-negative"),
+        pytest.param("pessimism", NAN, id="pessimism-nan"),
+        pytest.param("pessimism", INF, id="pessimism-inf"),
     ],
 )
 def test_bad_arguments_are_named(name, value):
     arguments = {"cost_limit": 1.0, "lr": 0.1, name: value}
     with pytest.raises(ValueError, match=f"^{name} must"):
         DualAscent(make_module(0.0, 0.0), **arguments)
+
+
+def test_normalized_limits_are_not_negative():
+    DualAscent(make_module(0.0), cost_limit=-1.0, lr=0.1)
+    with pytest.raises(ValueError, match="cost_limit must not be negative with normalize, got -1"):
+        DualAscent(make_module(0.0), cost_limit=-1.0, lr=0.1, normalize=True)
 
 
 def test_a_loss_without_the_buffer_is_refused():
@@ -324,14 +389,20 @@ class Doubling(MultiplierUpdater):
 
 def test_a_rule_is_one_method():
     loss = make_loss(num_costs=3, multiplier_init=torch.tensor([1.0, 0.5, 4.0]))
-    updater = Doubling(loss, cost_limit=torch.tensor([1.0, 5.0, 1.0]), max_multiplier=5.0)
+    updater = Doubling(
+        loss,
+        cost_limit=torch.tensor([1.0, 5.0, 1.0]),
+        max_multiplier=5.0,
+        pessimism=1.5,
+        normalize=True,
+    )
     updater.step(episodes(2.0, 2.0, 2.0))
     # Doubled; lowered and cut at 0; doubled and cut at 5.
     torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([2.0, 0.0, 5.0]))
     other = Doubling(make_loss(num_costs=3), cost_limit=0.0)
     other.load_state_dict(updater.state_dict())
     assert torch.equal(other.cost_limit, torch.tensor([1.0, 5.0, 1.0]))
-    assert other.max_multiplier == 5.0
+    assert (other.max_multiplier, other.pessimism, other.normalize) == (5.0, 1.5, True)
 
 
 def test_a_rule_without_the_method_cannot_be_made():

@@ -18,11 +18,14 @@ class CostUpdater(abc.ABC):
 
     Keyword Args:
         cost_limit (float or Tensor): limit of each expected episode cost, one number or k.
+        pessimism (float, optional): standard errors of the mean that are added to it.
     """
 
     _buffer: str
 
-    def __init__(self, loss_module: LossModule, *, cost_limit: float | Tensor) -> None:
+    def __init__(
+        self, loss_module: LossModule, *, cost_limit: float | Tensor, pessimism: float = 0.0
+    ) -> None:
         if not isinstance(loss_module, LossModule):
             raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
         buffer = dict(loss_module.named_buffers(recurse=False)).get(self._buffer)
@@ -36,8 +39,11 @@ class CostUpdater(abc.ABC):
             )
         if not limit.isfinite().all():
             raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
+        if not 0 <= pessimism < float("inf"):
+            raise ValueError(f"pessimism must be finite and not negative, got {pessimism}.")
         self.loss_module = loss_module
         self.cost_limit = limit.expand_as(buffer).clone()
+        self.pessimism = pessimism
 
     @torch.no_grad()
     def step(self, episode_cost: Tensor) -> None:
@@ -63,16 +69,24 @@ class CostUpdater(abc.ABC):
             raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
         if not len(episode_cost):
             return
-        mean_cost = episode_cost.to(buffer).mean(0)
-        self._move(buffer, mean_cost - self.cost_limit.to(buffer))
+        self._move(buffer, self._violation(episode_cost.to(buffer)))
+
+    def _violation(self, episode_cost: Tensor) -> Tensor:
+        return self._pessimistic_cost(episode_cost) - self.cost_limit.to(episode_cost)
+
+    def _pessimistic_cost(self, episode_cost: Tensor) -> Tensor:
+        mean = episode_cost.mean(0)
+        if len(episode_cost) == 1:  # It has no standard error.
+            return mean
+        return mean + self.pessimism * episode_cost.std(0) / len(episode_cost) ** 0.5
 
     @abc.abstractmethod
     def _move(self, buffer: Tensor, violation: Tensor) -> None:
-        """Writes the buffer in place; ``violation`` is mean episode cost minus limit, ``(k,)``."""
+        """Writes the buffer in place; ``violation`` is that of :meth:`_violation`, ``(k,)``."""
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the updater; the buffer is in the state of the loss."""
-        return {"cost_limit": self.cost_limit.clone()}
+        return {"cost_limit": self.cost_limit.clone(), "pessimism": self.pessimism}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads a state that :meth:`state_dict` returned.
@@ -86,3 +100,4 @@ class CostUpdater(abc.ABC):
                 f"{len(self.cost_limit)}."
             )
         self.cost_limit = state_dict["cost_limit"].clone()
+        self.pessimism = state_dict["pessimism"]

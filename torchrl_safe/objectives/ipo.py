@@ -48,24 +48,27 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
     (https://arxiv.org/abs/1910.09615). To the loss of PPO it adds
 
     .. math::
-        -\frac{1}{t} \sum_i \log\left(d_i - J_{c_i}(\pi_\theta)\right)
+        -\frac{1 - \gamma}{t} \sum_i \log\left(d_i - J_{c_i}(\pi_\theta)\right)
 
-    as ``"loss_penalty"``: a force of :math:`1 / (t (d_i - J_{c_i}))` that grows without bound
-    before the limit, and no multiplier to learn. A
-    :class:`~torchrl_safe.objectives.ViolationUpdater` brings :math:`J_{c_i} - d_i` of the policy
-    that collected the batch, once for each of them; the cost of the policy that is being trained
-    is estimated from it with PPO's clipped surrogate,
+    as ``"loss_penalty"``, which acts like a multiplier of :math:`1 / (t (d_i - J_{c_i}))` that
+    nobody has to learn. A :class:`~torchrl_safe.objectives.ViolationUpdater` brings
+    :math:`J_{c_i} - d_i` of the policy that collected the batch, once for each of them; the cost
+    of the policy that is being trained is estimated from it with PPO's clipped surrogate,
 
     .. math::
         J_{c_i}(\pi_\theta) \approx J_{c_i} + \frac{1}{1 - \gamma}
             \mathbb{E}[\max(r A_{c_i}, \mathrm{clip}(r) A_{c_i})],
 
-    :math:`\gamma` being the discount of the cost's value estimator. The paper presumes a policy
-    that starts within the limits; where one does not, the tangent of :func:`log_barrier` leads
-    back. A barrier keeps its distance: with one binding cost the policy settles where
-    :math:`t (d - J_c)` is the inverse of the optimal multiplier. OmniSafe's implementation puts
-    the barrier's force of the collecting policy in the place of a multiplier instead, and holds
-    it fixed while the policy moves.
+    :math:`\gamma` being the discount of the cost's value estimator. The factor :math:`1 - \gamma`
+    before the barrier is ours: it brings the barrier, which is about episodes, to the unit of
+    PPO's objective, which is about steps, so that t means the same whatever the discount.
+
+    A barrier keeps its distance: with one binding cost the policy settles where
+    :math:`t (d - J_c)` is the inverse of the optimal multiplier. The paper presumes a policy that
+    starts within the limits; where one does not, the tangent of :func:`log_barrier` leads back,
+    like a multiplier of t. OmniSafe's implementation gives the collecting policy's
+    :math:`1 / (t (d_i - J_{c_i}))` the place of a multiplier, and holds it fixed while the policy
+    moves.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): policy operator.
@@ -76,7 +79,8 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
 
     Keyword Args:
         num_costs (int, optional): number k of costs. Defaults to ``1``.
-        sharpness (float, optional): the paper's t. Defaults to ``20.0``, as there.
+        sharpness (float, optional): the paper's t: the larger, the closer to the limit the
+            barrier acts. Defaults to ``20.0``.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
@@ -163,5 +167,5 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
         self.register_coeff_buffer("sharpness", sharpness, device=self.cost_critic_coeff.device)
 
     def _penalty(self, surrogate: Tensor) -> Tensor:
-        rise = surrogate / (1 - self.cost_value_estimator.gamma)
-        return log_barrier(self.cost_violation + rise, self.sharpness)
+        scale = 1 - self.cost_value_estimator.gamma
+        return scale * log_barrier(self.cost_violation + surrogate / scale, self.sharpness)

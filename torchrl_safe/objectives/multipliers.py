@@ -29,9 +29,20 @@ class MultiplierUpdater(CostUpdater):
         cost_limit (float or Tensor): limit of each expected episode cost, one number or k, in
             the unit of the undiscounted episode cost.
         max_multiplier (float, optional): upper bound of every multiplier. Defaults to no bound.
+        pessimism (float, optional): standard errors of the batch's mean episode cost that are
+            added to it. A limit that binds is otherwise met on average only: policies end above
+            it as often as below. Few or uneven episodes are trusted less; a batch of one
+            episode has no standard error, and adds none. Defaults to ``0.0``.
+        normalize (bool, optional): measure the violation by what the costs are like: divided by
+            the larger of mean and limit, and by the larger of the episodes' standard deviation
+            and the limit. Costs in another unit, multiplied by ten say, then give a tenth of
+            the multiplier and change nothing else, so that one step size suits limits of 0.5 and
+            of 50, and an early policy that violates the limit a hundred times over does not
+            throw the multiplier out of reach. For costs that are never negative. Defaults to
+            ``False``.
 
     Raises:
-        ValueError: if the loss has no such buffer, or a limit or bound is not usable.
+        ValueError: if the loss has no such buffer, or a limit, bound or pessimism is not usable.
 
     Examples:
         >>> import torch
@@ -53,11 +64,16 @@ class MultiplierUpdater(CostUpdater):
         *,
         cost_limit: float | Tensor,
         max_multiplier: float | None = None,
+        pessimism: float = 0.0,
+        normalize: bool = False,
     ) -> None:
-        super().__init__(loss_module, cost_limit=cost_limit)
+        super().__init__(loss_module, cost_limit=cost_limit, pessimism=pessimism)
         if max_multiplier is not None and not max_multiplier > 0:
             raise ValueError(f"max_multiplier must be positive, got {max_multiplier}.")
+        if normalize and (self.cost_limit < 0).any():
+            raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
         self.max_multiplier = max_multiplier
+        self.normalize = normalize
 
     def _move(self, buffer: Tensor, violation: Tensor) -> None:
         proposal = self.next_multiplier(buffer, violation)
@@ -67,24 +83,44 @@ class MultiplierUpdater(CostUpdater):
             )
         buffer.copy_(proposal.clamp(0, self.max_multiplier))
 
+    def _violation(self, episode_cost: Tensor) -> Tensor:
+        violation = super()._violation(episode_cost)
+        if not self.normalize:
+            return violation
+        limit = self.cost_limit.to(episode_cost)
+        cost = self._pessimistic_cost(episode_cost)
+        # One episode says nothing of the spread; its cost is a spread of the right size.
+        single = len(episode_cost) == 1
+        spread = episode_cost.mean(0) if single else episode_cost.std(0)
+        spread = torch.maximum(spread, limit)
+        # Without any spread and with a limit of 0, the cost itself is all there is to measure by.
+        scale = torch.maximum(cost, limit) * torch.where(spread > 0, spread, cost)
+        return torch.where(scale > 0, violation / scale, 0.0)
+
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
         """Proposes the next multipliers; ``step`` projects them on ``[0, max_multiplier]``.
 
         Args:
             multiplier (Tensor): current multipliers, shape ``(k,)``. Not to be changed.
-            violation (Tensor): mean episode cost minus limit, shape ``(k,)``.
+            violation (Tensor): mean episode cost minus limit, shape ``(k,)``, with ``pessimism``
+                and ``normalize`` as they were chosen.
 
         Returns:
             The proposed multipliers, shape ``(k,)``.
         """
 
     def state_dict(self) -> dict[str, Any]:
-        return {**super().state_dict(), "max_multiplier": self.max_multiplier}
+        return {
+            **super().state_dict(),
+            "max_multiplier": self.max_multiplier,
+            "normalize": self.normalize,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
+        self.normalize = state_dict["normalize"]
 
 
 class DualAscent(MultiplierUpdater):
@@ -104,6 +140,9 @@ class DualAscent(MultiplierUpdater):
         cost_limit (float or Tensor): see :class:`MultiplierUpdater`.
         lr (float): step size, in multiplier per unit of violated cost.
         max_multiplier (float, optional): see :class:`MultiplierUpdater`.
+        pessimism (float, optional): see :class:`MultiplierUpdater`.
+        normalize (bool, optional): see :class:`MultiplierUpdater`. ``lr`` is then in multiplier
+            times standard deviation of the episode cost.
         optimizer (callable, optional): called as ``optimizer([parameter], lr=lr)``.
             Defaults to :class:`torch.optim.SGD`.
         parametrization (Transform, optional): the multiplier as a function of the parameter
@@ -134,10 +173,18 @@ class DualAscent(MultiplierUpdater):
         cost_limit: float | Tensor,
         lr: float,
         max_multiplier: float | None = None,
+        pessimism: float = 0.0,
+        normalize: bool = False,
         optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.SGD,
         parametrization: Transform = identity_transform,
     ) -> None:
-        super().__init__(loss_module, cost_limit=cost_limit, max_multiplier=max_multiplier)
+        super().__init__(
+            loss_module,
+            cost_limit=cost_limit,
+            max_multiplier=max_multiplier,
+            pessimism=pessimism,
+            normalize=normalize,
+        )
         if not 0 < lr < float("inf"):
             raise ValueError(f"lr must be positive and finite, got {lr}.")
         multiplier = loss_module.lagrange_multiplier

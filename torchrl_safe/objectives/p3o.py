@@ -67,7 +67,7 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
     Keyword Args:
         num_costs (int, optional): number k of costs. Defaults to ``1``.
         penalty_coeff (float, optional): the factor :math:`\kappa`, in units of standardized
-            reward advantage per cost advantage. Defaults to ``20.0``, as in the paper.
+            reward advantage per cost advantage. Defaults to ``20.0``.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.

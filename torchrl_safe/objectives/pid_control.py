@@ -52,6 +52,9 @@ class PIDControl(MultiplierUpdater):
             up to but without 1. It starts at the first batch (algorithm 2 starts at 0, so that
             the first batch counts as a rise). Defaults to ``0.0``, the cost itself, as there.
         max_multiplier (float, optional): see :class:`MultiplierUpdater`.
+        pessimism (float, optional): see :class:`MultiplierUpdater`.
+        normalize (bool, optional): see :class:`MultiplierUpdater`. The gains are then per unit of
+            normalized violation.
 
     Raises:
         ValueError: if a gain is negative or not finite, or ``smoothing`` is outside ``[0, 1)``.
@@ -82,8 +85,16 @@ class PIDControl(MultiplierUpdater):
         kd: float,
         smoothing: float = 0.0,
         max_multiplier: float | None = None,
+        pessimism: float = 0.0,
+        normalize: bool = False,
     ) -> None:
-        super().__init__(loss_module, cost_limit=cost_limit, max_multiplier=max_multiplier)
+        super().__init__(
+            loss_module,
+            cost_limit=cost_limit,
+            max_multiplier=max_multiplier,
+            pessimism=pessimism,
+            normalize=normalize,
+        )
         for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)):
             if not 0 <= gain < float("inf"):
                 raise ValueError(f"{name} must be finite and not negative, got {gain}.")
@@ -97,8 +108,9 @@ class PIDControl(MultiplierUpdater):
         self.last_multiplier = multiplier.clone()
 
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
-        limit = self.cost_limit.to(multiplier)
-        # The cost, not the violation: a limit that somebody changes is no rise.
+        # The cost, not the violation: a limit that somebody changes is no rise. (A normalized
+        # violation has no unit in which the limit could be added.)
+        limit = self.cost_limit.to(multiplier) * (not self.normalize)
         cost = violation + limit
         previous = self.smoothed_cost.to(multiplier)
         previous = torch.where(previous.isnan(), cost, previous)

@@ -27,9 +27,12 @@ class ViolationUpdater(CostUpdater):
     Keyword Args:
         cost_limit (float or Tensor): limit of each expected episode cost, one number or k, in
             the unit of the undiscounted episode cost.
+        pessimism (float, optional): standard errors of the batch's mean episode cost that are
+            added to it, as of :class:`~torchrl_safe.objectives.MultiplierUpdater`. Defaults to
+            ``0.0``.
 
     Raises:
-        ValueError: if the loss has no such buffer, or a limit is not usable.
+        ValueError: if the loss has no such buffer, or the limit or pessimism is not usable.
 
     Examples:
         >>> import torch

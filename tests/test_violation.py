@@ -1,0 +1,114 @@
+"""ViolationUpdater: the front door for losses that read how far costs are from their limits."""
+
+import re
+
+import pytest
+import torch
+from networks import make_batch, make_loss, make_networks
+from torchrl.objectives import LossModule
+
+from torchrl_safe.objectives import IPOLoss, P3OLoss, ViolationUpdater
+
+
+def make(num_costs=2, cost_limit=1.0, kind=P3OLoss):
+    loss = kind(*make_networks(num_costs), num_costs=num_costs)
+    return loss, ViolationUpdater(loss, cost_limit=cost_limit)
+
+
+@pytest.mark.parametrize("limit", [1.5, torch.tensor(1.5), torch.tensor([1.5, 4.0])], ids=str)
+def test_it_writes_mean_cost_minus_limit_in_place(limit):
+    loss, updater = make(cost_limit=limit)
+    assert loss.cost_violation.tolist() == [0.0, 0.0]
+    address = loss.cost_violation.data_ptr()
+    updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
+    second = 4.0 if torch.as_tensor(limit).ndim else 1.5
+    assert loss.cost_violation.tolist() == [1.5, 0.5 - second]
+    assert loss.cost_violation.data_ptr() == address
+    updater.step(torch.tensor([[1.5, second]]))
+    assert loss.cost_violation.tolist() == [0.0, 0.0]
+
+
+def test_pessimism_adds_standard_errors():
+    loss, _ = make()
+    updater = ViolationUpdater(loss, cost_limit=1.0, pessimism=2.0)
+    updater.step(torch.tensor([[2.0, 0.0], [4.0, 0.0]]))
+    torch.testing.assert_close(loss.cost_violation, torch.tensor([2.0 + 2.0 * 1.0, -1.0]))
+    updater.step(torch.tensor([[2.0, 0.0]]))  # One episode has no standard error.
+    assert loss.cost_violation.tolist() == [1.0, -1.0]
+    with pytest.raises(ValueError, match="pessimism must be finite and not negative, got -1"):
+        ViolationUpdater(loss, cost_limit=1.0, pessimism=-1.0)
+
+
+def test_without_an_episode_nothing_changes():
+    loss, updater = make()
+    updater.step(torch.tensor([[3.0, 0.0]]))
+    updater.step(torch.zeros(0, 2))
+    assert loss.cost_violation.tolist() == [2.0, -1.0]
+
+
+def test_the_violation_is_a_buffer_of_the_loss_and_reported():
+    saved, updater = make()
+    updater.step(torch.tensor([[3.0, 0.0]]))
+    assert not any("violation" in name for name, _ in saved.named_parameters())
+    loaded, _ = make()
+    loaded.load_state_dict(saved.state_dict())
+    losses = loaded(make_batch(2))
+    loaded.cost_violation.fill_(9.0)
+    assert losses["cost_violation_0"] == 2.0
+    assert losses["cost_violation_1"] == -1.0
+
+
+def test_a_violation_moves_the_penalty_of_the_next_call():
+    for kind in (P3OLoss, IPOLoss):
+        loss, updater = make(kind=kind)
+        data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+        penalties = []
+        for cost in (0.0, 50.0, 100.0):
+            updater.step(torch.full((1, 2), cost))
+            penalties.append(loss(data)["loss_penalty"].item())
+        assert penalties == sorted(set(penalties))
+
+
+def test_state_round_trip():
+    _, updater = make(cost_limit=torch.tensor([1.0, 2.0]))
+    loss, other = make(cost_limit=5.0)
+    other.load_state_dict(updater.state_dict())
+    other.step(torch.tensor([[1.0, 1.0]]))
+    assert loss.cost_violation.tolist() == [0.0, -1.0]
+    _, three = make(3)
+    with pytest.raises(ValueError, match="2 cost limits, this updater 3"):
+        three.load_state_dict(updater.state_dict())
+
+
+@pytest.mark.parametrize("shape", [(1,), (3,), (2, 1)], ids=str)
+def test_a_limit_of_the_wrong_length_is_refused(shape):
+    with pytest.raises(ValueError, match=rf"cost_limit.* 2 costs.*{re.escape(str(shape))}"):
+        make(cost_limit=torch.ones(shape))
+
+
+def test_what_cannot_be_a_limit_or_a_loss_is_refused():
+    with pytest.raises(ValueError, match="cost_limit must be finite, got nan"):
+        make(cost_limit=float("nan"))
+    with pytest.raises(ValueError, match="PPOLagrangianLoss has no cost_violation buffer"):
+        ViolationUpdater(make_loss(), cost_limit=1.0)
+    with pytest.raises(ValueError, match="LossModule has no cost_violation buffer"):
+        ViolationUpdater(LossModule(), cost_limit=1.0)
+    with pytest.raises(ValueError, match="must be a LossModule, got "):
+        ViolationUpdater(torch.nn.Linear(1, 1), cost_limit=1.0)
+
+
+@pytest.mark.parametrize(
+    ("cost", "message"),
+    [
+        (torch.ones(3, 1), r"episode_cost must have shape \(E, 2\), got \(3, 1\)"),
+        (torch.ones(2), r"episode_cost must have shape \(E, 2\), got \(2,\)"),
+        (torch.tensor([[1.0, float("nan")]]), "episode_cost must be finite"),
+    ],
+    ids=["width", "one-dimension", "nan"],
+)
+def test_costs_that_cannot_be_used_change_nothing(cost, message):
+    loss, updater = make()
+    updater.step(torch.tensor([[3.0, 0.0]]))
+    with pytest.raises(ValueError, match=message):
+        updater.step(cost)
+    assert loss.cost_violation.tolist() == [2.0, -1.0]
