@@ -32,13 +32,13 @@ from torchrl_safe.objectives import (
     PIDControl,
     TrustRegionLoss,
     TrustRegionMethod,
+    TrustRegionSolution,
     TrustRegionStep,
     ViolationUpdater,
 )
-from torchrl_safe.objectives.trust_region_methods import TrustRegionSolution
 
 MAX_KL = 0.01
-BATCH = 256
+BATCH = 128
 METHODS = {
     "trpo": TRPO(),
     "cpo": CPO(),
@@ -185,7 +185,7 @@ class ConstantDeviation(nn.Module):
 # ---------------------------------------------------------------- reductions
 
 
-def train(method, loss, steps=5, violation=None):
+def train(method, loss, steps=3, violation=None):
     step = TrustRegionStep(loss, method, max_kl=MAX_KL)
     if violation is not None:
         loss.cost_violation.fill_(violation)

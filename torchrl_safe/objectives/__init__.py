@@ -12,7 +12,14 @@ from torchrl_safe.objectives.p3o import P3OLoss
 from torchrl_safe.objectives.pid_control import PIDControl
 from torchrl_safe.objectives.ppo_lagrangian import PPOLagrangianLoss
 from torchrl_safe.objectives.trust_region_loss import TrustRegionLoss
-from torchrl_safe.objectives.trust_region_methods import CPO, PCPO, TRPO, TrustRegionMethod
+from torchrl_safe.objectives.trust_region_methods import (
+    CPO,
+    PCPO,
+    TRPO,
+    TrustRegionMethod,
+    TrustRegionProblem,
+    TrustRegionSolution,
+)
 from torchrl_safe.objectives.trust_region_step import TrustRegionStep
 from torchrl_safe.objectives.violation import ViolationUpdater
 
@@ -33,6 +40,8 @@ __all__ = [
     "PPOLagrangianLoss",
     "TrustRegionLoss",
     "TrustRegionMethod",
+    "TrustRegionProblem",
+    "TrustRegionSolution",
     "TrustRegionStep",
     "ViolationUpdater",
     "penalized_advantage",
