@@ -364,8 +364,9 @@ def test_masked_steps_count_nowhere():
         return TrustRegionStep(loss, CPO(), max_kl=MAX_KL).step(data), actor_state(loss)
 
     (info, parameters), (expected_info, expected) = stepped(True), stepped(False)
-    torch.testing.assert_close(parameters, expected)
-    torch.testing.assert_close(info["kl"], expected_info["kl"])
+    # Sums of other lengths round differently; one masked step that counted would change it all.
+    torch.testing.assert_close(parameters, expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(info["kl"], expected_info["kl"], rtol=1e-3, atol=0)
 
 
 def test_the_actor_that_the_user_holds_moves_in_place():
