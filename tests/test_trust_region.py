@@ -10,7 +10,7 @@ from torch import nn
 from torch.distributions import Categorical, kl_divergence
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
-from torchrl_safe.objectives import CPO, PCPO, TRPO
+from torchrl_safe.objectives import CPO, PCPO, TRPO, TrustRegionProblem
 from torchrl_safe.objectives.trust_region import (
     NotPositiveDefiniteError,
     backtracking_line_search,
@@ -21,7 +21,6 @@ from torchrl_safe.objectives.trust_region import (
     pcpo_weight,
     trpo_weight,
 )
-from torchrl_safe.objectives.trust_region_methods import TrustRegionProblem
 
 MAX_KL = 0.02
 

@@ -32,13 +32,13 @@ from torchrl_safe.objectives import (
     PIDControl,
     TrustRegionLoss,
     TrustRegionMethod,
+    TrustRegionSolution,
     TrustRegionStep,
     ViolationUpdater,
 )
-from torchrl_safe.objectives.trust_region_methods import TrustRegionSolution
 
 MAX_KL = 0.01
-BATCH = 256
+BATCH = 128
 METHODS = {
     "trpo": TRPO(),
     "cpo": CPO(),
@@ -185,7 +185,7 @@ class ConstantDeviation(nn.Module):
 # ---------------------------------------------------------------- reductions
 
 
-def train(method, loss, steps=5, violation=None):
+def train(method, loss, steps=3, violation=None):
     step = TrustRegionStep(loss, method, max_kl=MAX_KL)
     if violation is not None:
         loss.cost_violation.fill_(violation)
@@ -364,8 +364,9 @@ def test_masked_steps_count_nowhere():
         return TrustRegionStep(loss, CPO(), max_kl=MAX_KL).step(data), actor_state(loss)
 
     (info, parameters), (expected_info, expected) = stepped(True), stepped(False)
-    torch.testing.assert_close(parameters, expected)
-    torch.testing.assert_close(info["kl"], expected_info["kl"])
+    # Sums of other lengths round differently; one masked step that counted would change it all.
+    torch.testing.assert_close(parameters, expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(info["kl"], expected_info["kl"], rtol=1e-3, atol=0)
 
 
 def test_the_actor_that_the_user_holds_moves_in_place():

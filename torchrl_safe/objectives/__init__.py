@@ -15,7 +15,14 @@ from torchrl_safe.objectives.ppo_lagrangian import PPOLagrangianLoss
 from torchrl_safe.objectives.sac_lagrangian import SACLagrangianLoss
 from torchrl_safe.objectives.td3_lagrangian import TD3LagrangianLoss
 from torchrl_safe.objectives.trust_region_loss import TrustRegionLoss
-from torchrl_safe.objectives.trust_region_methods import CPO, PCPO, TRPO, TrustRegionMethod
+from torchrl_safe.objectives.trust_region_methods import (
+    CPO,
+    PCPO,
+    TRPO,
+    TrustRegionMethod,
+    TrustRegionProblem,
+    TrustRegionSolution,
+)
 from torchrl_safe.objectives.trust_region_step import TrustRegionStep
 from torchrl_safe.objectives.violation import ViolationUpdater
 
@@ -39,6 +46,8 @@ __all__ = [
     "TD3LagrangianLoss",
     "TrustRegionLoss",
     "TrustRegionMethod",
+    "TrustRegionProblem",
+    "TrustRegionSolution",
     "TrustRegionStep",
     "ViolationUpdater",
     "penalized_advantage",

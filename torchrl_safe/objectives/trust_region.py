@@ -272,7 +272,7 @@ def pcpo_weight(reward_weight: float, r: float, s: float, c: float) -> float:
         \beta = \max\left(0, \frac{\alpha r + c}{s}\right),\quad
         r = b^T H^{-1} g,\quad s = b^T L^{-1} b
 
-    (Yang et al. 2020, https://arxiv.org/abs/2010.03152, equation 4).
+    (Yang et al. 2020, https://arxiv.org/abs/2010.03152, the update in closed form).
 
     Args:
         reward_weight (float): :math:`\alpha`.

@@ -63,6 +63,7 @@ class TrustRegionMethod(abc.ABC):
 
     Examples:
         >>> from dataclasses import dataclass
+        >>> from torchrl_safe.objectives import TrustRegionMethod, TrustRegionSolution
         >>> @dataclass(frozen=True)
         ... class PlainGradient(TrustRegionMethod):
         ...     lr: float = 0.1

@@ -49,6 +49,7 @@ class TrustRegionStep:
     (Achiam et al. 2017, https://arxiv.org/abs/1705.10528, section 6.1). If no length will do, or
     the damped Fisher matrix is found not to be positive definite, the parameters stay as they
     were, bit for bit, and ``rejected_steps`` or ``indefinite_steps`` counts it.
+    Exactly at a limit, as before the first episode has ended, no step that raises the cost passes.
 
     The surrogates are means over steps, a limit is one of whole episodes: the loss's
     ``cost_violation`` is divided by the length of an episode before ``method`` gets it, which is
