@@ -10,12 +10,12 @@ READY := $(VENV)/.ready
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
 
-# One thread each: the processes have the cores to themselves.
+# One thread each: the processes have the cores to themselves. Tests of one file share its long runs.
 test: $(READY)  ## everything but the slow tests, on two cores
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not slow" $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
 
-test-slow: $(READY)  ## the tests that train for minutes
-	$(BIN)/pytest -m slow $(ARGS)
+test-slow: $(READY)  ## every combination, and the tests that train for minutes
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m slow $(ARGS)
 
 paper: $(READY)  ## Table 1 and Figure 2 of the paper, run again; goes on where it was stopped
 	$(BIN)/python -m experiments.paper $(ARGS)

@@ -210,7 +210,7 @@ def _of_ppo(make: Callable[..., LossModule]) -> Any:
 def _with_budget(config: Config) -> list[Transform]:
     # The reward of a step is around -1 and better.
     saute = Saute(config.cost_limit, unsafe_reward=-2.0)
-    return [saute, CatTensors(["observation", "remaining_budget"], "observation")]
+    return [saute, CatTensors(["observation", "remaining_budget"], "observation", del_keys=False)]
 
 
 def _terminating(config: Config) -> list[Transform]:

@@ -99,7 +99,7 @@ def table(runs: list[dict[str, Any]], config: Config) -> str:
         mine = _select(runs, action, limit)
         costs = episode_costs(mine)
         kept = "" if limit is None else f"{(costs.mean(1) <= limit).sum()}/{len(mine)}"
-        middle = mean(costs.unsqueeze(-1), resample="seeds")
+        middle = mean(costs.unsqueeze(-1), resample="seeds" if len(mine) > 1 else "episodes")
         returns = torch.tensor([run["evaluation"]["return"][0] for run in mine])
         multipliers = [run["history"][-1]["multiplier/collision"] for run in mine]
         success = successes(mine)

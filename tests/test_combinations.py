@@ -1,12 +1,10 @@
 """Every arm with every action, task and layout of obstacles: all choices fit all others."""
 
-import itertools
-
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
-from worlds import ARMS
+from worlds import ARMS, combinations
 
 from torchrl_safe.envs import (
     ArmEnv,
@@ -52,7 +50,7 @@ COSTS = {
         "in": Workspace(Region((0, -0.5, 0), (1, 0.5, 1))),
     },
 }
-LONG, SHORT, DISTURBED = 200, 60, 25
+LONG, SHORT, DISTURBED = 120, 60, 25
 
 
 def play(env, actions, disturb=()):
@@ -77,11 +75,7 @@ def play(env, actions, disturb=()):
 
 
 @pytest.mark.parametrize(
-    ("arm", "action", "task", "obstacles"),
-    [
-        pytest.param(*names, id="-".join(names))
-        for names in itertools.product(ARMS, ACTIONS, TASKS, OBSTACLES)
-    ],
+    ("arm", "action", "task", "obstacles"), combinations(ARMS, ACTIONS, TASKS, OBSTACLES)
 )
 def test_combination(make_env, arm, action, task, obstacles):
     """Specs; finite values; a seed is a rollout, bit for bit; resets are worlds' own affairs."""

@@ -59,6 +59,15 @@ def test_environments(tmp_path):
     run(script)
 
 
+def test_algorithms(tmp_path):
+    """Each kind of loop runs on the networks and the batch of the first block."""
+    setting, *loops = code_of("docs/algorithms.md")
+    assert len(loops) == 3
+    script = tmp_path / "algorithms.py"
+    script.write_text("\n".join(setting + loop for loop in loops), encoding="utf-8")
+    assert run(script) == "tensor(True) 0\n"
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda p: p.stem)
 def test_tutorial(path):
     assert run(path)

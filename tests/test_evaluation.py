@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torchrl._utils import seed_generator
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.objectives import LossModule
 
 from experiments.evaluation import evaluate, summarize
 from experiments.report import table
@@ -87,11 +88,14 @@ def test_figures_of_a_batch():
         },
         batch_size=[4],
     )
+    loss = LossModule()
+    loss.register_buffer("lagrange_multiplier", torch.tensor([0.5]))
     multiplier = {"multiplier/collision": 0.5}
     expected = {"return": -3, "cost/collision": 0.5, "success": 0.75, **multiplier}
-    assert figures(episodes, torch.tensor([0.5])) == expected
+    assert figures(episodes, loss) == expected
     # No episode ended: no mean of nothing, which would be NaN.
-    assert figures(episodes[:0], torch.tensor([0.5])) == multiplier
+    assert figures(episodes[:0], loss) == multiplier
+    assert figures(episodes[:0], LossModule()) == {}, "not every algorithm has multipliers"
 
 
 def test_table_of_hand_made_results():

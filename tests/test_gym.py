@@ -16,9 +16,18 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.monitor import Monitor
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
+from worlds import combinations
 
 from torchrl_safe.envs import PAPER_JOINT, ArmEnv, Collision, JointDelta, NoObstacles
-from torchrl_safe.envs.gym import ArmGymEnv, SafeGymEnv, SafeGymWrapper
+from torchrl_safe.envs.gym import (
+    ACTIONS,
+    ARMS,
+    OBSTACLES,
+    TASKS,
+    ArmGymEnv,
+    SafeGymEnv,
+    SafeGymWrapper,
+)
 
 NAME = "torchrl_safe/PandaReachInFront-v0"
 
@@ -54,10 +63,16 @@ def count_one(state):
 TWO_COSTS = {"collision": Collision(), "one": count_one}
 
 
-@pytest.mark.parametrize("name", [n for n in gymnasium.registry if n.startswith("torchrl_safe/")])
-def test_checkers_of_gymnasium_and_stable_baselines(name):
+@pytest.mark.parametrize(
+    "parts",
+    [
+        pytest.param(p.values, id=p.id, marks=p.marks)
+        for p in combinations(ARMS, TASKS, OBSTACLES, ACTIONS)
+    ],
+)
+def test_checkers_of_gymnasium_and_stable_baselines(parts):
     """Neither raises nor warns; rendering, which would open a window, is tested elsewhere."""
-    env = gymnasium.make(name)
+    env = gymnasium.make(f"torchrl_safe/{''.join(parts)}-v0")
     check_env(env.unwrapped, skip_render_check=True)
     check_env_sb3(env.unwrapped, warn=True, skip_render_check=True)
     env.close()

@@ -19,7 +19,7 @@ from scripted import (
     push_straight,
     straight,
 )
-from worlds import each_arm
+from worlds import ARMS, each_arm
 
 from torchrl_safe.envs import (
     PANDA,
@@ -59,7 +59,14 @@ def settings(arm, task):
 
 
 @each_task
-@each_arm
+@pytest.mark.parametrize(
+    "arm",
+    [
+        # The arms that come with PyBullet, and for `make test-slow` those of ``more-arms``.
+        pytest.param(arm, id=name, marks=() if index < 3 else pytest.mark.slow)
+        for index, (name, arm) in enumerate(ARMS.items())
+    ],
+)
 def test_success_costs_nothing(make_env, arm, task):
     """To who looks where the obstacle is; who does not, touches it."""
     careful, careless = PILOTS[task]

@@ -4,7 +4,6 @@ import dataclasses
 import json
 
 import pytest
-import torch
 from PIL import Image
 
 from experiments import multiplier_profile, sweep
@@ -62,18 +61,36 @@ def test_sweep_counts_the_seeds_that_keep_the_limit():
     assert cells[5:] == ["75.0%", "50.0%", "-3.00", "0.00 to 2.00"]
 
 
-def test_profile(tmp_path):
-    config = multiplier_profile.Config(**SMALL, multipliers=(0.0, 4.0), limits=(0.5,), out=tmp_path)
+@pytest.mark.slow
+def test_profile_runs_fixed_multipliers(tmp_path):
+    config = multiplier_profile.Config(**SMALL, multipliers=(4.0,), limits=(), out=tmp_path)
     multiplier_profile.main(config)
-    runs = json.loads((tmp_path / "results.json").read_text())["runs"]
-    assert [(run["rule"], run["value"]) for run in runs] == [
-        ("fixed", 0.0), ("fixed", 4.0), ("dual-ascent", 0.5), ("pid", 0.5),
+    (run,) = json.loads((tmp_path / "results.json").read_text())["runs"]
+    assert (run["rule"], run["value"]) == ("fixed", 4.0)
+    assert {row["multiplier/collision"] for row in run["history"]} == {4.0}
+    config = dataclasses.replace(config, limits=(0.5,), seeds=2)
+    assert [path.name for path in missing(multiplier_profile.jobs(config))] == [
+        "dual-ascent-0.5-0.json", "pid-0.5-0.json",
+        "fixed-4-1.json", "dual-ascent-0.5-1.json", "pid-0.5-1.json",
     ]  # fmt: skip
-    last = [run["history"][-1]["multiplier/collision"] for run in runs]
-    assert last[:2] == [0.0, 4.0]
-    assert last[3] > last[2] > 0
-    assert (tmp_path / "table.md").read_text() == multiplier_profile.table(runs)
+
+
+def test_profile_shows_fixed_multipliers_and_rules(tmp_path):
+    def end(rule, value, cost, multiplier):
+        evaluation = {"return": [-3.0], "cost/collision": [cost], "success": [1.0]}
+        history = [{"multiplier/collision": multiplier}]
+        return {"rule": rule, "value": value, "evaluation": evaluation, "history": history}
+
+    runs = [
+        end("fixed", 0.0, 5.0, 0.0), end("fixed", 3.0, 0.25, 3.0), end("fixed", 3.0, 0.75, 3.0),
+        end("dual-ascent", 0.5, 0.4, 2.0), end("pid", 0.5, 0.3, 2.5),
+    ]  # fmt: skip
+    assert multiplier_profile.table(runs).splitlines()[2:] == [
+        "| fixed at 0 | -3.00 ± 0.00 | 5.00 ± 0.00 | 1.00 ± 0.00 | 0.00 ± 0.00 |",
+        "| fixed at 3 | -3.00 ± 0.00 | 0.50 ± 0.25 | 1.00 ± 0.00 | 3.00 ± 0.00 |",
+        "| dual-ascent, limit 0.5 | -3.00 ± 0.00 | 0.40 ± 0.00 | 1.00 ± 0.00 | 2.00 ± 0.00 |",
+        "| pid, limit 0.5 | -3.00 ± 0.00 | 0.30 ± 0.00 | 1.00 ± 0.00 | 2.50 ± 0.00 |",
+    ]
+    multiplier_profile.plot(runs, tmp_path / "profile.png")
     with Image.open(tmp_path / "profile.png") as image:
         assert image.width > 500
-    found = multiplier_profile.points(runs)["fixed", 4.0]
-    torch.testing.assert_close(found[0, 1], runs[1]["evaluation"]["cost/collision"][0])

@@ -4,15 +4,19 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
+import tyro
 from PIL import Image
 from torchrl.checkpoint import Checkpoint
 
 from experiments.agent import make_agent
+from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES
+from experiments.learners import NoiseSchedule
 from experiments.report import table
-from experiments.train import MULTIPLIER_RULES, Config, make_env
+from experiments.train import AlgorithmName, Config, main, make_env, train
 
 ROOT = Path(__file__).parent.parent
 
@@ -28,12 +32,15 @@ def run(*arguments):
     )
 
 
-def make_loss():
+KINDS = {"cpo", "cup", "ppo-saute", "td3-lagrangian"}
+
+
+def make_training(algorithm="ppo-lagrangian", **settings):
     torch.manual_seed(0)
-    env = make_env(Config(), num_envs=1, seed=0)
-    _, loss = make_agent(env, gamma=0.97)
+    env = make_env(Config(), num_envs=1, seed=0, algorithm=algorithm)
+    training = ALGORITHMS[algorithm].build(env, Config(**settings))
     env.close()
-    return loss
+    return training
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +48,7 @@ def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     done = run(
         "--frames", 2048, "--frames-per-batch", 1024, "--envs", 8, "--workers", 1,
-        "--eval-episodes", 32, "--out", out,
+        "--eval-episodes", 32, "--multiplier-init", 5, "--out", out,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     return out, done.stdout
@@ -72,47 +79,48 @@ def test_ppo_has_no_multiplier_and_its_brother_has(finished):
         name: [row["multiplier/collision"] for row in run["history"]] for name, run in runs.items()
     }
     assert multipliers["ppo"] == [0, 0]
-    assert multipliers["ppo-lagrangian"][-1] > 0
+    first, second = multipliers["ppo-lagrangian"]
+    assert 5 != first != second > 0
 
 
 def test_checkpoint_holds_the_loss(finished):
     out, _ = finished
     results = json.loads((out / "results.json").read_text())
-    loss = make_loss()
+    loss = make_training().loss
     before = {key: value.clone() for key, value in loss.state_dict().items()}
     Checkpoint(loss=loss).load(out / "ppo-lagrangian" / "checkpoint")
     last = results["algorithms"]["ppo-lagrangian"]["history"][-1]
     assert loss.lagrange_multiplier.item() == pytest.approx(last["multiplier/collision"])
     assert not torch.equal(
-        before["actor_network_params.module.0.module.0.0.weight"],
-        loss.state_dict()["actor_network_params.module.0.module.0.0.weight"],
+        before["actor_network_params.module.0.module.0.1.0.weight"],
+        loss.state_dict()["actor_network_params.module.0.module.0.1.0.weight"],
     )
 
 
 def test_a_run_is_not_written_over(finished):
     out, _ = finished
     before = (out / "results.json").read_bytes()
-    done = run("--out", out)
-    assert done.returncode != 0
-    assert "out must be a new or empty folder" in done.stderr
+    with pytest.raises(FileExistsError, match="out must be a new or empty folder"):
+        main(Config(out=out))
     assert (out / "results.json").read_bytes() == before
 
 
-def test_help_names_the_options():
-    done = run("--help")
-    assert done.returncode == 0
+def test_help_names_the_options(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        tyro.cli(Config, args=["--help"])
+    shown = capsys.readouterr().out
     for option in (
         "arm", "action", "algorithms", "cost-limit", "frames", "envs", "workers", "seed", "out",
         "logger", "multiplier-rule",
     ):  # fmt: skip
-        assert f"--{option}" in done.stdout
+        assert f"--{option}" in shown
 
 
 def test_multiplier_rules():
     """An episode 2 above the limit: 0.1 times 2, with proportional control 5 times as much more."""
     multiplier = {}
     for name, rule in MULTIPLIER_RULES.items():
-        loss = make_loss()
+        loss = make_training().loss
         rule(loss, 0.1, cost_limit=1.0).step(torch.tensor([[3.0]]))
         multiplier[name] = loss.lagrange_multiplier.item()
     assert multiplier == pytest.approx({"dual-ascent": 0.2, "pid": 1.2})
@@ -122,20 +130,67 @@ def test_agent_knows_the_scale_of_what_it_sees_and_predicts():
     config = Config(paper=True, observation="paper")
     torch.manual_seed(0)
     env = make_env(config, num_envs=4, seed=0)
-    actor, loss = make_agent(env, gamma=0.99, multiplier_init=2.0)
+    agent = make_agent(env, gamma=0.99)
     with torch.no_grad():
         seen = env.rollout(100, break_when_any_done=False)
-        standardized = actor.get_submodule("0.module.0.0")(seen["observation"])
-        value = loss.critic_network(seen.clone())["state_value"]
+        standardized = agent.actor.get_submodule("0.module.0.0")(seen["observation"])
+        value = agent.critic(seen.clone())["state_value"]
     env.close()
     # Of other episodes than the ones it was fitted to: the target differs, the rest does not.
     assert standardized.mean().abs() < 0.5
     assert 0.2 < standardized[..., :3].std() < 3
     # A step costs about -0.6 of reward; the untrained prediction is small in that unit.
     assert 0 < value.abs().mean() < 5
-    assert loss.lagrange_multiplier.item() == 2.0
     # The paper's actions are not bounded, so the policy is a plain Gaussian.
-    assert type(actor.get_dist(seen)).__name__ == "IndependentNormal"
+    assert type(agent.actor.get_dist(seen)).__name__ == "IndependentNormal"
+
+
+def test_every_algorithm_has_a_name():
+    assert set(ALGORITHMS) == set(get_args(AlgorithmName))
+
+
+# One of each kind for `make test`. That they learn is tested on a problem of known optimum.
+@pytest.mark.parametrize(
+    "algorithm",
+    [pytest.param(name, marks=() if name in KINDS else pytest.mark.slow) for name in ALGORITHMS],
+)
+def test_every_algorithm_trains(algorithm, tmp_path):
+    config = Config(
+        frames=512, frames_per_batch=256, envs=16, workers=1, epochs=1, out=tmp_path, gamma=0.9
+    )
+    actor, history = train(config, algorithm, progress=False)
+    assert [row["frames"] for row in history] == [256, 512]
+    torch.manual_seed(0)
+    fresh = make_training(algorithm, gamma=0.9).actor
+    moved = [
+        not torch.equal(old, new)
+        for old, new in zip(fresh.parameters(), actor.parameters(), strict=True)
+    ]
+    assert any(moved)
+    assert (tmp_path / algorithm / "checkpoint").exists()
+
+
+def test_a_fixed_multiplier_stays():
+    training = make_training(multiplier_rule="fixed", multiplier_init=2.0)
+    assert training.updater is None
+    assert training.loss.lagrange_multiplier.item() == 2.0
+    assert make_training("ppo", multiplier_init=2.0).loss.lagrange_multiplier.item() == 0.0
+
+
+def test_noise_falls_from_batch_to_batch():
+    log_std = torch.nn.Parameter(torch.zeros(2))
+    schedule = NoiseSchedule(log_std, last=-2.0, batches=4)
+    seen = []
+    for _ in range(2):
+        schedule.step()
+        seen.append(log_std.tolist())
+    resumed = NoiseSchedule(log_std, last=-2.0, batches=4)
+    resumed.load_state_dict(schedule.state_dict())
+    for _ in range(2):
+        resumed.step()
+        seen.append(log_std.tolist())
+    assert seen == [[-0.5, -0.5], [-1.0, -1.0], [-1.5, -1.5], [-2.0, -2.0]]
+    assert not log_std.requires_grad
 
 
 @pytest.mark.parametrize(

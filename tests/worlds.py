@@ -4,6 +4,8 @@ The turntable is a bar that turns about a vertical axis: 1 m long, 0.1 m wide, 0
 middle at (0, 0, 0.5) m. Its tool point is the end that points along x at home.
 """
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -20,6 +22,21 @@ from torchrl_safe.envs import (
 )
 
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
+
+
+def combinations(*choices):
+    """All combinations as parameters; a third, with every pair of choices in it, is not slow."""
+    names = [list(choice) for choice in choices]
+    return [
+        pytest.param(
+            *(choice[index] for choice, index in zip(names, indices, strict=True)),
+            id="-".join(choice[index] for choice, index in zip(names, indices, strict=True)),
+            marks=[pytest.mark.slow] if sum(indices) % 3 else [],
+        )
+        for indices in itertools.product(*(range(len(choice)) for choice in names))
+    ]
+
+
 each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
 
 _TURNTABLE = """

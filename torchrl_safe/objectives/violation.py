@@ -17,8 +17,9 @@ class ViolationUpdater(CostUpdater):
     """Tells a loss how far the batch's mean episode costs are from their limits.
 
     It writes the ``cost_violation`` buffer that :class:`~torchrl_safe.objectives.P3OLoss`,
-    :class:`~torchrl_safe.objectives.IPOLoss` and :class:`~torchrl_safe.objectives.CRPOLoss`
-    read, once for each collected batch and before the batch is learned from. Until the first
+    :class:`~torchrl_safe.objectives.IPOLoss`, :class:`~torchrl_safe.objectives.CRPOLoss` and, for
+    CPO and PCPO, :class:`~torchrl_safe.objectives.TrustRegionLoss` read, once for each collected
+    batch and before the batch is learned from. Until the first
     episode has ended the buffer is zero: as if every cost stood at its limit.
 
     Args:
