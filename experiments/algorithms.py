@@ -109,6 +109,7 @@ class OnPolicy:
         method: the step that a trust-region method takes with the actor.
         projects: whether each batch has a second phase, CUP's projection.
         transforms: called as ``transforms(config)``, what is appended to the environment.
+        training_transforms: the same, but not when the policy is evaluated.
     """
 
     loss: Callable[..., LossModule]
@@ -117,6 +118,7 @@ class OnPolicy:
     method: TrustRegionMethod | None = None
     projects: bool = False
     transforms: Callable[[Config], list[Transform]] = no_transforms
+    training_transforms: Callable[[Config], list[Transform]] = no_transforms
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
@@ -159,6 +161,7 @@ class OffPolicy:
     stochastic: bool
     updater: Callable[[LossModule, Config], Updater | None] = move_multiplier
     transforms: Callable[[Config], list[Transform]] = no_transforms
+    training_transforms: Callable[[Config], list[Transform]] = no_transforms
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
@@ -234,7 +237,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "crpo": OnPolicy(_wrapping(CRPOLoss, ClipPPOLoss), tell_violation),
     "ppo-saute": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, transforms=_with_budget),
     "ppo-early-termination": OnPolicy(
-        _of_ppo(PPOLagrangianLoss), keep_multiplier, transforms=_terminating
+        _of_ppo(PPOLagrangianLoss), keep_multiplier, training_transforms=_terminating
     ),
     "sac-lagrangian": OffPolicy(SACLagrangianLoss, stochastic=True),
     "td3-lagrangian": OffPolicy(TD3LagrangianLoss, stochastic=False),

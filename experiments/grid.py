@@ -38,10 +38,16 @@ def run_grid(
     todo = missing(jobs)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context) as pool:
-        paths = {pool.submit(run, *jobs[path]): path for path in todo}
-        for done in tqdm(as_completed(paths), total=len(todo), desc=name, unit="run"):
-            # A stopped program leaves no half of a file behind.
-            unfinished = paths[done].with_suffix(".unfinished")
-            unfinished.write_text(json.dumps(done.result()))
-            unfinished.rename(paths[done])
+        running = [pool.submit(_run_and_keep, run, path, jobs[path]) for path in todo]
+        for done in tqdm(as_completed(running), total=len(todo), desc=name, unit="run"):
+            if done.exception() is not None:
+                pool.shutdown(cancel_futures=True)
+                done.result()
     return [json.loads(path.read_text()) for path in jobs]
+
+
+def _run_and_keep(run: Callable[..., dict[str, Any]], path: Path, arguments: Any) -> None:
+    # A program that is stopped leaves no half of a file behind.
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(json.dumps(run(*arguments)))
+    unfinished.rename(path)

@@ -29,7 +29,7 @@ from torchrl.objectives import LossModule
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
-from experiments.algorithms import ALGORITHMS
+from experiments.algorithms import ALGORITHMS, OffPolicy
 from experiments.evaluation import evaluate, summarize
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.envs import (
@@ -130,7 +130,7 @@ class Config:
     """Control steps in a minibatch."""
     learning_rate: float = 5e-4
     """Adam's learning rate of the policy at the start, half that of the critics; both fall
-    linearly to 0."""
+    linearly to 0. Off policy all networks have twice as much, and keep it."""
     last_log_std: float = -1.5
     """Logarithm of the policy's standard deviation at the end, before the squashing; it starts at
     0 and falls linearly."""
@@ -162,6 +162,13 @@ class Config:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
+        for name in self.algorithms:
+            if self.paper and isinstance(ALGORITHMS[name], OffPolicy):
+                raise ValueError(
+                    f"algorithms must not contain {name} with paper: it needs bounded actions."
+                )
+            if name == "ppo-saute" and not self.cost_limit:
+                raise ValueError("cost_limit must be positive with ppo-saute, got 0.")
         for name, divisor in (("envs", "workers"), ("frames_per_batch", "envs")):
             if getattr(self, name) % getattr(self, divisor):
                 raise ValueError(
@@ -171,7 +178,12 @@ class Config:
 
 
 def make_env(
-    config: Config, num_envs: int, seed: int | None = None, algorithm: AlgorithmName = "ppo"
+    config: Config,
+    num_envs: int,
+    seed: int | None = None,
+    algorithm: AlgorithmName = "ppo",
+    *,
+    training: bool = False,
 ) -> EnvBase:
     """Makes the environment that an algorithm trains in, with sums of reward and cost.
 
@@ -194,7 +206,10 @@ def make_env(
             **settings,
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
-    return TransformedEnv(env, Compose(sums, *ALGORITHMS[algorithm].transforms(config)))
+    transforms = ALGORITHMS[algorithm].transforms(config)
+    if training:
+        transforms += ALGORITHMS[algorithm].training_transforms(config)
+    return TransformedEnv(env, Compose(sums, *transforms))
 
 
 @contextmanager
@@ -208,10 +223,11 @@ def collecting(
         "auto_register_policy_transforms": False,
     }
     if config.workers == 1:
-        env = make_env(config, config.envs, algorithm=algorithm)
+        env = make_env(config, config.envs, algorithm=algorithm, training=True)
         collector = Collector(env, policy, **settings)
     else:
-        factory = partial(make_env, config, config.envs // config.workers, algorithm=algorithm)
+        worlds = config.envs // config.workers
+        factory = partial(make_env, config, worlds, algorithm=algorithm, training=True)
         collector = MultiSyncCollector([factory] * config.workers, policy, **settings)
     collector.set_seed(config.seed)
     try:

@@ -140,10 +140,11 @@ def test_pessimism_adds_nothing_to_a_single_episode():
     [
         # Mean 2 of standard deviation sqrt 8.
         pytest.param([0.0, 4.0], 1.0, 0.0, 1 / (2 * math.sqrt(8)), id="mean-and-deviation"),
-        pytest.param([0.0, 4.0], 1.0, 1.0, 3 / (4 * math.sqrt(8)), id="pessimistic"),
+        pytest.param([0.0, 4.0], 1.0, 1.0, 3 / (2 * math.sqrt(8)), id="pessimistic"),
         pytest.param([1.0, 1.0], 2.0, 0.0, -1 / (2 * 2), id="limit-for-both"),
         pytest.param([4.0], 1.0, 0.0, 3 / (4 * 4), id="one-episode"),
         pytest.param([3.0, 3.0], 0.0, 0.0, 3 / (3 * 3), id="limit-zero-no-deviation"),
+        pytest.param([3.0, 3.000001], 0.0, 0.0, 3 / (3 * 3), id="limit-zero-little-deviation"),
         pytest.param([0.0, 0.0], 0.0, 2.0, 0.0, id="nothing-at-all"),
     ],
 )
@@ -171,6 +172,35 @@ def test_normalized_multipliers_follow_the_unit_of_the_cost(rule):
         rules[1].step(1000 * costs)
         torch.testing.assert_close(1000 * grams.lagrange_multiplier, kilograms.lagrange_multiplier)
     assert kilograms.lagrange_multiplier.item() > 0
+
+
+def test_violations_are_normalized_by_the_batches_before():
+    # First by itself, 2 / (2 * 2); then by that; then by the mean of 0.9 times 4 and 0.1 times 16.
+    module = make_module(0.0)
+    updater = DualAscent(module, cost_limit=0.0, lr=1.0, normalize=True)
+    seen = []
+    for cost in (2.0, 4.0, 1.0):
+        updater.step(torch.tensor([[cost], [cost]]))
+        seen.append(module.lagrange_multiplier.item())
+    expected = [0.5, 0.5 + 4 / 4, 0.5 + 4 / 4 + 1 / (0.9 * 4 + 0.1 * 16)]
+    assert seen == pytest.approx(expected)
+    other = DualAscent(make_module(seen[-1]), cost_limit=0.0, lr=1.0)
+    other.load_state_dict(updater.state_dict())
+    for each in (updater, other):
+        each.step(torch.tensor([[3.0]]))
+    assert torch.equal(other.loss_module.lagrange_multiplier, module.lagrange_multiplier)
+
+
+@pytest.mark.parametrize(("chance", "grows"), [(0.1, True), (0.025, False)])
+def test_rare_costs_are_judged_by_their_mean(chance, grows):
+    """One episode in ten costs 10: twice the limit of 0.5; one in forty: half of it."""
+    generator = torch.Generator().manual_seed(0)
+    module = make_module(5.0)
+    updater = DualAscent(module, cost_limit=0.5, lr=0.4, normalize=True)
+    for _ in range(300):
+        updater.step(10 * (torch.rand(16, 1, generator=generator) < chance).float())
+    multiplier = module.lagrange_multiplier.item()
+    assert multiplier > 20 if grows else multiplier < 1
 
 
 # ---------------------------------------------------------------- what must change nothing

@@ -170,6 +170,14 @@ def test_every_algorithm_trains(algorithm, tmp_path):
     assert (tmp_path / algorithm / "checkpoint").exists()
 
 
+def test_what_ends_an_episode_early_ends_none_that_is_evaluated():
+    name = "ppo-early-termination"
+    for training in (True, False):
+        env = make_env(Config(), num_envs=1, algorithm=name, training=training)
+        assert ("accumulated_cost" in env.observation_spec.keys()) is training
+        env.close()
+
+
 def test_a_fixed_multiplier_stays():
     training = make_training(multiplier_rule="fixed", multiplier_init=2.0)
     assert training.updater is None
@@ -207,6 +215,8 @@ def test_noise_falls_from_batch_to_batch():
         ({"learning_rate": float("nan")}, "learning_rate must be positive, got nan"),
         ({"cost_limit": -1.0}, "cost_limit must not be negative, got -1.0"),
         ({"algorithms": ()}, "algorithms must name at least one"),
+        ({"algorithms": ("cpo", "td3-lagrangian"), "paper": True}, "not contain td3-lagrangian"),
+        ({"algorithms": ("ppo-saute",), "cost_limit": 0.0}, "cost_limit must be positive with ppo"),
     ],
 )
 def test_bad_settings(settings, message):

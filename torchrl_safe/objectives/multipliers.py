@@ -33,13 +33,13 @@ class MultiplierUpdater(CostUpdater):
             added to it. A limit that binds is otherwise met on average only: policies end above
             it as often as below. Few or uneven episodes are trusted less; a batch of one
             episode has no standard error, and adds none. Defaults to ``0.0``.
-        normalize (bool, optional): measure the violation by what the costs are like: divided by
-            the larger of mean and limit, and by the larger of the episodes' standard deviation
-            and the limit. Costs in another unit, multiplied by ten say, then give a tenth of
-            the multiplier and change nothing else, so that one step size suits limits of 0.5 and
-            of 50, and an early policy that violates the limit a hundred times over does not
-            throw the multiplier out of reach. For costs that are never negative. Defaults to
-            ``False``.
+        normalize (bool, optional): divide the violation by what the costs have been like: by the
+            larger of mean and limit, times the largest of mean, standard deviation and limit,
+            as a moving average over the batches before. Costs in another unit, multiplied by ten
+            say, then give a tenth of the multiplier and (with a step that is proportional to
+            the violation) change nothing else, and an early policy that violates the limit a
+            hundred times over does not throw the multiplier out of reach. For costs that are
+            never negative. Defaults to ``False``.
 
     Raises:
         ValueError: if the loss has no such buffer, or a limit, bound or pessimism is not usable.
@@ -74,6 +74,8 @@ class MultiplierUpdater(CostUpdater):
             raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
         self.max_multiplier = max_multiplier
         self.normalize = normalize
+        # Zero until there has been something to measure by.
+        self.cost_scale = torch.zeros_like(self.cost_limit)
 
     def _move(self, buffer: Tensor, violation: Tensor) -> None:
         proposal = self.next_multiplier(buffer, violation)
@@ -83,19 +85,32 @@ class MultiplierUpdater(CostUpdater):
             )
         buffer.copy_(proposal.clamp(0, self.max_multiplier))
 
+    @torch.no_grad()
+    def step(self, episode_cost: Tensor) -> None:
+        super().step(episode_cost)
+        if self.normalize and len(episode_cost):
+            current = self._scale_of(episode_cost)
+            past = self._past_scale(current)
+            self.cost_scale = past.lerp(current, 0.1)
+
     def _violation(self, episode_cost: Tensor) -> Tensor:
         violation = super()._violation(episode_cost)
         if not self.normalize:
             return violation
-        limit = self.cost_limit.to(episode_cost)
-        cost = self._pessimistic_cost(episode_cost)
-        # One episode says nothing of the spread; its cost is a spread of the right size.
-        single = len(episode_cost) == 1
-        spread = episode_cost.mean(0) if single else episode_cost.std(0)
-        spread = torch.maximum(spread, limit)
-        # Without any spread and with a limit of 0, the cost itself is all there is to measure by.
-        scale = torch.maximum(cost, limit) * torch.where(spread > 0, spread, cost)
+        # Of past batches, not of this one: a batch with few costs would count for more than one
+        # with many, and the limit would be exceeded on average.
+        scale = self._past_scale(self._scale_of(episode_cost))
         return torch.where(scale > 0, violation / scale, 0.0)
+
+    def _scale_of(self, episode_cost: Tensor) -> Tensor:
+        limit = self.cost_limit.to(episode_cost)
+        mean = episode_cost.to(limit).mean(0)
+        deviation = episode_cost.to(limit).std(0) if len(episode_cost) > 1 else mean
+        return torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
+
+    def _past_scale(self, current: Tensor) -> Tensor:
+        past = self.cost_scale.to(current)
+        return torch.where(past > 0, past, current)
 
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
@@ -115,12 +130,14 @@ class MultiplierUpdater(CostUpdater):
             **super().state_dict(),
             "max_multiplier": self.max_multiplier,
             "normalize": self.normalize,
+            "cost_scale": self.cost_scale.clone(),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
         self.normalize = state_dict["normalize"]
+        self.cost_scale = state_dict["cost_scale"].clone()
 
 
 class DualAscent(MultiplierUpdater):

@@ -54,7 +54,7 @@ class PIDControl(MultiplierUpdater):
         max_multiplier (float, optional): see :class:`MultiplierUpdater`.
         pessimism (float, optional): see :class:`MultiplierUpdater`.
         normalize (bool, optional): see :class:`MultiplierUpdater`. The gains are then per unit of
-            normalized violation.
+            normalized violation, whose rise it is that the derivative term answers.
 
     Raises:
         ValueError: if a gain is negative or not finite, or ``smoothing`` is outside ``[0, 1)``.
