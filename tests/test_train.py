@@ -174,7 +174,7 @@ def test_what_ends_an_episode_early_ends_none_that_is_evaluated():
     name = "ppo-early-termination"
     for training in (True, False):
         env = make_env(Config(), num_envs=1, algorithm=name, training=training)
-        assert ("accumulated_cost" in env.observation_spec.keys()) is training
+        assert ("accumulated_cost" in list(env.observation_spec.keys())) is training
         env.close()
 
 
