@@ -1,6 +1,7 @@
 """The multiplier updaters, against hand numbers and against the published formulas."""
 
 import copy
+import itertools
 import math
 import re
 from functools import partial
@@ -175,15 +176,15 @@ def test_normalized_multipliers_follow_the_unit_of_the_cost(rule):
 
 
 def test_violations_are_normalized_by_the_batches_before():
-    # First by itself, 2 / (2 * 2); then by that; then by the mean of 0.9 times 4 and 0.1 times 16.
+    # By the largest so far, 2 * 2, then 4 * 4; then by 0.9 times 16 and 0.1 times 1 * 1.
     module = make_module(0.0)
     updater = DualAscent(module, cost_limit=0.0, lr=1.0, normalize=True)
     seen = []
-    for cost in (2.0, 4.0, 1.0):
+    for cost in (2.0, 4.0, 1.0, 1.0):
         updater.step(torch.tensor([[cost], [cost]]))
         seen.append(module.lagrange_multiplier.item())
-    expected = [0.5, 0.5 + 4 / 4, 0.5 + 4 / 4 + 1 / (0.9 * 4 + 0.1 * 16)]
-    assert seen == pytest.approx(expected)
+    steps = [2 / 4, 4 / 16, 1 / 16, 1 / (0.9 * 16 + 0.1 * 1)]
+    assert seen == pytest.approx(list(itertools.accumulate(steps)))
     other = DualAscent(make_module(seen[-1]), cost_limit=0.0, lr=1.0)
     other.load_state_dict(updater.state_dict())
     for each in (updater, other):

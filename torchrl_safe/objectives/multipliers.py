@@ -35,7 +35,7 @@ class MultiplierUpdater(CostUpdater):
             episode has no standard error, and adds none. Defaults to ``0.0``.
         normalize (bool, optional): divide the violation by what the costs have been like: by the
             larger of mean and limit, times the largest of mean, standard deviation and limit,
-            as a moving average over the batches before. Costs in another unit, multiplied by ten
+            the largest of all batches so far, of which each new one forgets a tenth. Costs in another unit, multiplied by ten
             say, then give a tenth of the multiplier and (with a step that is proportional to
             the violation) change nothing else, and an early policy that violates the limit a
             hundred times over does not throw the multiplier out of reach. For costs that are
@@ -74,7 +74,7 @@ class MultiplierUpdater(CostUpdater):
             raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
         self.max_multiplier = max_multiplier
         self.normalize = normalize
-        # Zero until there has been something to measure by.
+        # The largest so far, slowly forgotten.
         self.cost_scale = torch.zeros_like(self.cost_limit)
 
     def _move(self, buffer: Tensor, violation: Tensor) -> None:
@@ -90,16 +90,16 @@ class MultiplierUpdater(CostUpdater):
         super().step(episode_cost)
         if self.normalize and len(episode_cost):
             current = self._scale_of(episode_cost)
-            past = self._past_scale(current)
-            self.cost_scale = past.lerp(current, 0.1)
+            past = self.cost_scale.to(current)
+            self.cost_scale = torch.maximum(current, past.lerp(current, 0.1))
 
     def _violation(self, episode_cost: Tensor) -> Tensor:
         violation = super()._violation(episode_cost)
         if not self.normalize:
             return violation
-        # Of past batches, not of this one: a batch with few costs would count for more than one
-        # with many, and the limit would be exceeded on average.
-        scale = self._past_scale(self._scale_of(episode_cost))
+        # Not of this batch alone: one with few costs would count for more than one with many, and
+        # rare costs would exceed the limit on average.
+        scale = torch.maximum(self._scale_of(episode_cost), self.cost_scale.to(violation))
         return torch.where(scale > 0, violation / scale, 0.0)
 
     def _scale_of(self, episode_cost: Tensor) -> Tensor:
@@ -107,10 +107,6 @@ class MultiplierUpdater(CostUpdater):
         mean = episode_cost.to(limit).mean(0)
         deviation = episode_cost.to(limit).std(0) if len(episode_cost) > 1 else mean
         return torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
-
-    def _past_scale(self, current: Tensor) -> Tensor:
-        past = self.cost_scale.to(current)
-        return torch.where(past > 0, past, current)
 
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
