@@ -33,13 +33,13 @@ class MultiplierUpdater(CostUpdater):
             added to it. A limit that binds is otherwise met on average only: policies end above
             it as often as below. Few or uneven episodes are trusted less; a batch of one
             episode has no standard error, and adds none. Defaults to ``0.0``.
-        normalize (bool, optional): divide the violation by what the costs have been like: by the
-            larger of mean and limit, times the largest of mean, standard deviation and limit,
-            the largest of all batches so far, of which each new one forgets a tenth. Costs in another unit, multiplied by ten
-            say, then give a tenth of the multiplier and (with a step that is proportional to
-            the violation) change nothing else, and an early policy that violates the limit a
-            hundred times over does not throw the multiplier out of reach. For costs that are
-            never negative. Defaults to ``False``.
+        normalize (bool, optional): divide the violation by what the costs are like: by the
+            larger of mean and limit, times the largest of mean, standard deviation and limit;
+            the largest of all batches so far, of which each new one forgets a tenth. Costs in
+            another unit, multiplied by ten say, then give a tenth of the multiplier and (with a
+            step that is proportional to the violation) change nothing else, and an early policy
+            that violates the limit a hundred times over does not throw the multiplier out of
+            reach. For costs that are never negative. Defaults to ``False``.
 
     Raises:
         ValueError: if the loss has no such buffer, or a limit, bound or pessimism is not usable.
