@@ -175,6 +175,14 @@ def test_normalized_multipliers_follow_the_unit_of_the_cost(rule):
     assert kilograms.lagrange_multiplier.item() > 0
 
 
+def test_integer_costs_are_normalized_as_numbers():
+    module = make_module(0.0)
+    updater = DualAscent(module, cost_limit=0.5, lr=1.0, normalize=True)
+    updater.step(torch.tensor([[1], [1]]))
+    torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([0.5]))
+    torch.testing.assert_close(updater.cost_scale, torch.tensor([1.0]))
+
+
 def test_violations_are_normalized_by_the_batches_before():
     # By the largest so far, 2 * 2, then 4 * 4; then by 0.9 times 16 and 0.1 times 1 * 1.
     module = make_module(0.0)

@@ -89,7 +89,7 @@ class MultiplierUpdater(CostUpdater):
     def step(self, episode_cost: Tensor) -> None:
         super().step(episode_cost)
         if self.normalize and len(episode_cost):
-            current = self._scale_of(episode_cost)
+            current = self._scale_of(episode_cost.to(self.loss_module.lagrange_multiplier))
             past = self.cost_scale.to(current)
             self.cost_scale = torch.maximum(current, past.lerp(current, 0.1))
 
@@ -104,8 +104,8 @@ class MultiplierUpdater(CostUpdater):
 
     def _scale_of(self, episode_cost: Tensor) -> Tensor:
         limit = self.cost_limit.to(episode_cost)
-        mean = episode_cost.to(limit).mean(0)
-        deviation = episode_cost.to(limit).std(0) if len(episode_cost) > 1 else mean
+        mean = episode_cost.mean(0)
+        deviation = episode_cost.std(0) if len(episode_cost) > 1 else mean
         return torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
 
     @abc.abstractmethod
