@@ -23,7 +23,7 @@ from torchrl_safe.envs import (
     Region,
     Scene,
 )
-from torchrl_safe.envs.batch import split
+from torchrl_safe.envs.batch import parts, split
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.rotations import rotation_vector
 
@@ -58,7 +58,7 @@ def test_tool_reaches_targets_to_a_millimetre(make_env, solver):
 def state_of(world):
     """What DampedLeastSquares reads, of one world whose joints were set by hand."""
     return SimpleNamespace(
-        **split(np.array([world.read(fresh=True)]), world.read_shapes()),
+        **split(np.array([world.read(fresh=True)]), parts(world.read_shapes())),
         joint_lower=world.joint_lower,
         joint_upper=world.joint_upper,
     )

@@ -31,7 +31,7 @@ class Pose:
     def __init__(self, arm, folder):
         self.client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self.client}
-        text, joints, tool_link = prepare_urdf(arm, visuals=False, fix_fingers=True)
+        text, joints, tool_link = prepare_urdf(arm, visuals=False, fix_fingers=True, merge=False)
         file = folder / "arm.urdf"
         file.write_text(text)
         self.arm = pybullet.loadURDF(str(file), useFixedBase=True, **client)

@@ -108,7 +108,7 @@ def test_tool_pose_lags_one_substep(make_env):
     env = make_env(paper_env, seed=0)
     env.reset()
     step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0]]))
-    fresh = np.array(env._worlds[0].read(fresh=True))[16:19]
+    fresh = np.array(env._worlds[0].read(fresh=True))[18:21]
     step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0]]))
     np.testing.assert_allclose(env.arm_state.ee_position[0], fresh, atol=1e-6)
 

@@ -2,10 +2,13 @@ import importlib.metadata
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pybullet_data
 import pytest
 
-from torchrl_safe.envs import PANDA, ArmModel, Gripper
+from torchrl_safe.envs import PANDA, ArmModel, Gripper, Placement, Scene
+from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.gym import ARMS
 from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
 
 
@@ -18,7 +21,7 @@ def movable(root):
 
 
 def test_fingers_are_fixed_and_visuals_dropped():
-    text, chain, tool_link = prepare_urdf(PANDA, visuals=False, fix_fingers=True)
+    text, chain, tool_link = prepare_urdf(PANDA, visuals=False, fix_fingers=True, merge=False)
     root = ElementTree.fromstring(text)
     assert movable(root) == chain == {f"panda_joint{i}" for i in range(1, 8)}
     assert tool_link == "panda_grasptarget"
@@ -29,7 +32,7 @@ def test_fingers_are_fixed_and_visuals_dropped():
 def test_every_joint_beyond_the_tool_is_fixed():
     """Also one that turns."""
     short = arm(PANDA.urdf, "panda_link5")
-    text, chain, _ = prepare_urdf(short, visuals=False, fix_fingers=True)
+    text, chain, _ = prepare_urdf(short, visuals=False, fix_fingers=True, merge=False)
     root = ElementTree.fromstring(text)
     assert movable(root) == chain == {f"panda_joint{i}" for i in range(1, 6)}
 
@@ -46,7 +49,7 @@ def test_meshes_of_a_package_are_found_and_all_visuals_dropped(tmp_path):
         f'<robot name="r"><link name="tool">{visual}{visual}<collision><geometry>'
         '<mesh filename="package://robot/meshes/tool.obj"/></geometry></collision></link></robot>'
     )
-    text = prepare_urdf(arm(path, "tool"), visuals=False, fix_fingers=True).text
+    text = prepare_urdf(arm(path, "tool"), visuals=False, fix_fingers=True, merge=False).text
     root = ElementTree.fromstring(text)
     assert [found.get("filename") for found in root.iter("mesh")] == [str(mesh)]
     assert not [*root.iter("visual")]
@@ -54,7 +57,9 @@ def test_meshes_of_a_package_are_found_and_all_visuals_dropped(tmp_path):
 
 def test_everything_else_stays():
     whole = arm(PANDA.urdf, "panda_hand")
-    root = ElementTree.fromstring(prepare_urdf(whole, visuals=True, fix_fingers=False).text)
+    root = ElementTree.fromstring(
+        prepare_urdf(whole, visuals=True, fix_fingers=False, merge=False).text
+    )
     types = {j.get("name"): j.get("type") for j in root.findall("joint")}
     assert types["panda_finger_joint1"] == "prismatic"
     assert all(Path(mesh.get("filename")).is_file() for mesh in root.iter("mesh"))
@@ -63,7 +68,7 @@ def test_everything_else_stays():
 
 def test_unknown_link_is_named():
     with pytest.raises(ValueError, match=r"ee_link must be a link .*panda_hand.*got 'nowhere'"):
-        prepare_urdf(arm(PANDA.urdf, "nowhere"), visuals=False, fix_fingers=True)
+        prepare_urdf(arm(PANDA.urdf, "nowhere"), visuals=False, fix_fingers=True, merge=False)
 
 
 @pytest.mark.parametrize("content", [None, "not xml"], ids=["missing", "not-xml"])
@@ -72,7 +77,7 @@ def test_unreadable_file_is_named(tmp_path, content):
     if content is not None:
         path.write_text(content)
     with pytest.raises(ValueError, match=r"urdf must be a readable URDF file, got '.*arm.urdf'"):
-        prepare_urdf(arm(path, "tool"), visuals=False, fix_fingers=True)
+        prepare_urdf(arm(path, "tool"), visuals=False, fix_fingers=True, merge=False)
 
 
 def test_missing_mesh_is_named(tmp_path):
@@ -82,7 +87,7 @@ def test_missing_mesh_is_named(tmp_path):
         '<mesh filename="package://gone.obj"/></geometry></collision></link></robot>'
     )
     with pytest.raises(ValueError, match=r"names a mesh that does not exist: 'package://gone.obj'"):
-        prepare_urdf(arm(path, "tool"), visuals=False, fix_fingers=True)
+        prepare_urdf(arm(path, "tool"), visuals=False, fix_fingers=True, merge=False)
 
 
 def make_urdf(path, *elements):
@@ -101,7 +106,8 @@ def test_gripper_is_attached(tmp_path):
         '<parent link="palm"/><child link="other"/><mimic joint="slide"/></joint>',
     )
     gripper = Gripper(claw, "palm", position=(0.1, 0, 0.02), rotation=(0, 0.5, 0))
-    prepared = prepare_urdf(arm(flange, "palm", gripper), visuals=False, fix_fingers=False)
+    mounted = arm(flange, "palm", gripper)
+    prepared = prepare_urdf(mounted, visuals=False, fix_fingers=False, merge=False)
     root = ElementTree.fromstring(prepared.text)
     assert prepared.tool_link == "gripper/palm"
     links = {link.get("name") for link in root.findall("link")}
@@ -115,17 +121,19 @@ def test_gripper_is_attached(tmp_path):
     # The fingers do not move the palm; what does not move the tool is fixed.
     assert not prepared.joints
     assert movable(root) == {"gripper/slide", "gripper/follow"}
-    fixed = prepare_urdf(arm(flange, "palm", gripper), visuals=False, fix_fingers=True)
+    fixed = prepare_urdf(mounted, visuals=False, fix_fingers=True, merge=False)
     assert not movable(ElementTree.fromstring(fixed.text))
     # A joint between flange and tool is one of the arm's, wherever it is written.
     tip = arm(flange, "palm", Gripper(claw, "tip"))
-    assert prepare_urdf(tip, visuals=False, fix_fingers=True).joints == {"gripper/slide"}
+    assert prepare_urdf(tip, visuals=False, fix_fingers=True, merge=False).joints == {
+        "gripper/slide"
+    }
 
 
 def test_unknown_tool_link_is_named():
-    gripper = Gripper("gripper.urdf", "tip")
+    wrong = arm(PANDA.urdf, "panda_link8", Gripper("gripper.urdf", "tip"))
     with pytest.raises(ValueError, match=r"tool_link must be a link .*palm.*tool.*got 'tip'"):
-        prepare_urdf(arm(PANDA.urdf, "panda_link8", gripper), visuals=False, fix_fingers=True)
+        prepare_urdf(wrong, visuals=False, fix_fingers=True, merge=False)
 
 
 def test_urdf_is_found_by_its_path_or_in_the_packages(tmp_path):
@@ -161,8 +169,90 @@ def test_frames_weigh_nothing(tmp_path):
         '<link name="tip"/><joint name="end" type="fixed">',
         '<parent link="beam"/><child link="tip"/></joint>',
     )
-    text = prepare_urdf(arm(path, "tip"), visuals=False, fix_fingers=True).text
+    text = prepare_urdf(arm(path, "tip"), visuals=False, fix_fingers=True, merge=False).text
     masses = {link.get("name"): link.find("inertial/mass") for link in ElementTree.fromstring(text)}
     assert masses["tip"].get("value") == "0"
     # What moves needs inertia, and has that of PyBullet.
     assert masses["base"] is masses["beam"] is None
+
+
+def test_links_that_hold_together_become_one(tmp_path):
+    """Masses and inertias by hand: a bar of two equal balls on a turning arm, and its tip."""
+    path = make_urdf(
+        tmp_path / "arm.urdf",
+        '<link name="base"/><link name="arm">',
+        inertial("0 0 0", "0 0 0", 2.0, (0.1, 0.2, 0.3)),
+        '</link><link name="bar">',
+        inertial("1 0 0", "0 0 1.5707963267948966", 2.0, (0.5, 0.6, 0.7)),
+        '<collision><origin xyz="0 0 2"/><geometry><sphere radius="0.1"/></geometry></collision>',
+        '<visual><geometry><sphere radius="0.1"/></geometry></visual></link>',
+        '<link name="tip"/><link name="claw"/>',
+        '<joint name="turn" type="revolute"><parent link="base"/><child link="arm"/></joint>',
+        '<joint name="weld" type="fixed"><parent link="arm"/><child link="bar"/>',
+        '<origin xyz="0 0 1" rpy="0 0 0"/></joint>',
+        '<joint name="end" type="fixed"><parent link="bar"/><child link="tip"/>',
+        '<origin xyz="0 3 0" rpy="0 1.5707963267948966 0"/></joint>',
+        '<joint name="grip" type="revolute"><parent link="tip"/><child link="claw"/>',
+        '<origin xyz="0 0 4"/></joint>',
+    )
+    text, chain, _ = prepare_urdf(arm(path, "tip"), visuals=True, fix_fingers=False, merge=True)
+    root = ElementTree.fromstring(text)
+    assert chain == {"turn"}
+    assert [link.get("name") for link in root.findall("link")] == ["base", "arm", "tip", "claw"]
+    whole, tip = root.find("link[@name='arm']"), root.find("link[@name='tip']")
+    assert float(whole.find("inertial/mass").get("value")) == 4
+    # Centres at the origin and, a metre up, 1 m along x: each half a metre away in both.
+    assert numbers(whole.find("inertial/origin").get("xyz")) == [0.5, 0, 0.5]
+    moments = {name: float(value) for name, value in whole.find("inertial/inertia").attrib.items()}
+    # The bar is turned by a quarter: its moments about x and y change places. Each ball of 2 kg
+    # adds m (|d|^2 - d d^T) with d = (0.5, 0, 0.5).
+    expected = {"ixx": 0.1 + 0.6 + 1, "iyy": 0.2 + 0.5 + 2, "izz": 0.3 + 0.7 + 1, "ixz": -1.0}
+    assert moments == pytest.approx({"ixy": 0.0, "iyz": 0.0, **expected})
+    assert numbers(whole.find("collision/origin").get("xyz")) == [0, 0, 3]
+    assert numbers(whole.find("visual/origin").get("xyz")) == [0, 0, 1]
+    # The tool's frame stays, without mass; what it carried is carried by the arm.
+    assert float(tip.find("inertial/mass").get("value")) == 0
+    assert numbers(root.find("joint[@name='end']/origin").get("xyz")) == [0, 3, 1]
+    assert root.find("joint[@name='end']/parent").get("link") == "arm"
+    grip = root.find("joint[@name='grip']")
+    assert grip.find("parent").get("link") == "arm"
+    assert numbers(grip.find("origin").get("xyz")) == pytest.approx([4, 3, 1])
+    assert numbers(grip.find("origin").get("rpy")) == pytest.approx([0, np.pi / 2, 0])
+
+
+def inertial(xyz, rpy, mass, moments):
+    diagonal = " ".join(f"{n}='{v}'" for n, v in zip(("ixx", "iyy", "izz"), moments, strict=True))
+    return (
+        f"<inertial><origin xyz='{xyz}' rpy='{rpy}'/><mass value='{mass}'/>"
+        f"<inertia {diagonal} ixy='0' ixz='0' iyz='0'/></inertial>"
+    )
+
+
+def numbers(text):
+    return [float(number) for number in text.split()]
+
+
+@pytest.mark.parametrize("name", sorted(ARMS))
+def test_merged_arms_move_as_they_did(name):
+    """Every arm, with inertias from its URDF, flung about for half a second."""
+    worlds = [World(ARMS[name], Scene(merged_links=m, urdf_inertia=True), ()) for m in (0, 1)]
+    generator = np.random.default_rng(0)
+    try:
+        for world in worlds:
+            world.reset(no_obstacles(), np.zeros(3), np.zeros((0, 3)))
+        for _ in range(10):
+            target = np.add(ARMS[name].home, generator.uniform(-0.3, 0.3, len(ARMS[name].home)))
+            for world in worlds:
+                world.advance(target.tolist(), [], 12)
+        before, after = (np.array(world.read(fresh=True)) for world in worlds)
+    finally:
+        for world in worlds:
+            world.close()
+    joints = len(ARMS[name].home)
+    np.testing.assert_allclose(after[:joints], before[:joints], atol=2e-4)
+    tool = slice(2 * joints, 2 * joints + 7)
+    np.testing.assert_allclose(after[tool], before[tool], atol=2e-4)
+
+
+def no_obstacles():
+    return Placement(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0, dtype=bool))

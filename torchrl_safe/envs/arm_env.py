@@ -139,7 +139,12 @@ class ArmEnv(EnvBase):
         self.frame_skip = frame_skip
         self.max_episode_steps = max_episode_steps
         self._observation = observation
-        self._scene = replace(scene, free_fingers=True) if action.moves_fingers else scene
+        # What touches objects has friction and stiffness of its own, link by link.
+        self._scene = replace(
+            scene,
+            free_fingers=scene.free_fingers or action.moves_fingers,
+            merged_links=scene.merged_links and not task.objects,
+        )
         self._elapsed = np.zeros(num_envs, dtype=int)
         self.set_seed(seed)
         sensors = {name: cost.sensing for name, cost in costs.items() if isinstance(cost, Sensor)}

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.bullet import TOOL_MOTION, World
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.scene import Camera, Scene
+from torchrl_safe.envs.sensors import velocity_at
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
+
+Parts = Mapping[str, tuple[slice, tuple[int, ...]]]
 
 
 class WorldBatch:
@@ -54,8 +59,8 @@ class WorldBatch:
             self.close()
             raise
         self._sizes = np.array([shape.half_extents for shape in shapes]).reshape(-1, 3)
-        self._shapes = self.worlds[0].read_shapes()
-        self._trace_shapes = self.worlds[0].trace_shapes()
+        self._parts = parts(self.worlds[0].read_shapes())
+        self._trace_parts = parts(self.worlds[0].trace_shapes())
         self._rows: list[Sequence[float]] = [()] * num_envs
         self._measured: list[Sequence[Sequence[float]]] = [()] * num_envs
         self._present = np.zeros((num_envs, len(shapes)), dtype=bool)
@@ -74,21 +79,26 @@ class WorldBatch:
 
     def advance(self, joints: Array, fingers: Array) -> None:
         """Takes a control step towards joint targets ``(N, n)`` and finger targets ``(N, f)``."""
-        for row, (world, joint_target, finger_target) in enumerate(
-            zip(self.worlds, joints.tolist(), fingers.tolist(), strict=True)
-        ):
-            distances, forces, measured = world.advance(
-                joint_target, finger_target, self._frame_skip
+        contacts = [
+            world.advance(joint_target, finger_target, self._frame_skip)
+            for world, joint_target, finger_target in zip(
+                self.worlds, joints.tolist(), fingers.tolist(), strict=True
             )
-            self._contact_distance[row] = distances
-            self._contact_force[row] = forces
-            self._measured[row] = measured
-            self._rows[row] = world.read()
+        ]
+        distances, forces, measured = zip(*contacts, strict=True)
+        self._contact_distance, self._contact_force = np.array(distances), np.array(forces)
+        self._measured = [*measured]
+        self._rows = [world.read() for world in self.worlds]
 
     def state(self) -> ArmState:
         """Returns the state of all worlds."""
+        row = split(np.array(self._rows), self._parts)
+        tool = [row["ee_position"], *(row.pop(name) for name in TOOL_MOTION)]
+        velocity = velocity_at(*([*part.T] for part in tool))
+        del row["finger_velocity"]
         return ArmState(
-            **split(np.array(self._rows), self._shapes),
+            **row,
+            ee_velocity=np.stack(velocity, axis=1),
             joint_lower=self.worlds[0].joint_lower,
             joint_upper=self.worlds[0].joint_upper,
             obstacle_present=self._present.copy(),
@@ -96,7 +106,7 @@ class WorldBatch:
             contact_distance=self._contact_distance.copy(),
             contact_force=self._contact_force.copy(),
             trace=Trace(
-                split(np.array(self._measured), self._trace_shapes) if self._trace_shapes else {}
+                split(np.array(self._measured), self._trace_parts) if self._trace_parts else {}
             ),
         )
 
@@ -118,11 +128,19 @@ class WorldBatch:
             self._picture_world.close()
 
 
-def split(table: Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Cuts the last axis of a table into named parts of the given shapes."""
-    widths = [int(np.prod(shape)) for shape in shapes.values()]
-    parts = np.split(table, np.cumsum(widths)[:-1], axis=-1)
+def parts(shapes: Mapping[str, tuple[int, ...]]) -> Parts:
+    """Where the named parts of the given shapes are in a row that has them one after the other."""
+    widths = [math.prod(shape) for shape in shapes.values()]
+    ends = list(accumulate(widths))
     return {
-        name: part.reshape(*table.shape[:-1], *shape)
-        for (name, shape), part in zip(shapes.items(), parts, strict=True)
+        name: (slice(end - width, end), shape)
+        for (name, shape), width, end in zip(shapes.items(), widths, ends, strict=True)
+    }
+
+
+def split(table: Array, parts: Parts) -> dict[str, Array]:
+    """Cuts the last axis of a table into its parts."""
+    return {
+        name: table[..., where].reshape(*table.shape[:-1], *shape)
+        for name, (where, shape) in parts.items()
     }

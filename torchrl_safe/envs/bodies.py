@@ -65,7 +65,9 @@ def load_arm(
     Raises:
         ValueError: if the URDF does not load or the home pose does not fit it.
     """
-    text, chain, tool_link = prepare_urdf(arm, visuals=visuals, fix_fingers=not scene.free_fingers)
+    text, chain, tool_link = prepare_urdf(
+        arm, visuals=visuals, fix_fingers=not scene.free_fingers, merge=scene.merged_links
+    )
     flags = pybullet.URDF_USE_INERTIA_FROM_FILE if scene.urdf_inertia else 0
     if self_collision:
         flags |= pybullet.URDF_USE_SELF_COLLISION

@@ -22,11 +22,13 @@ from torchrl_safe.envs.bodies import (
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.rotations import UPRIGHT, rotation_vector
 from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
-from torchrl_safe.envs.sensors import MovingBody, Sensors, Vector, link_state, velocity_at
+from torchrl_safe.envs.sensors import MovingBody, Sensors, Vector, link_state
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import Array, Sensing
 
 _RED, _YELLOW, _BLUE = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.15, 0.4, 0.8, 1.0)
+#: Centre of mass of the tool link, m, its velocity, m/s, and the link's angular velocity, rad/s.
+TOOL_MOTION = ("ee_centre", "ee_centre_velocity", "ee_angular_velocity")
 _LIMBO = (0.0, 0.0, -100.0)
 _AT_REST = (0.0, 0.0, 0.0)
 
@@ -98,9 +100,11 @@ class World:
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
         furniture = load_furniture(client, scene, visuals=visuals)
         self._arm = load_arm(client, arm, scene, visuals=visuals, self_collision=sensing.itself)
+        self._driven = self._arm.joints + self._arm.fingers
         self._sensors = Sensors(
             client, self._arm, furniture, len(shapes), sensing, fresh_links=scene.fresh_links
         )
+        self._senses = sensing != Sensing()
         red, blue = (_RED, _BLUE) if visuals else (None, None)
         self._obstacles = [
             add_shape(client, shape, _limbo(index), red) for index, shape in enumerate(shapes)
@@ -131,6 +135,8 @@ class World:
         self._home = pybullet.saveState(physicsClientId=client)
         self._goal: Vector = _LIMBO
         self._present: list[int] = []
+        self._bodies_move = True
+        self._bodies: list[float] = []
         self._poses: list[tuple[Vector, Vector]] = [
             (_limbo(index), UPRIGHT) for index in range(len(shapes))
         ]
@@ -178,6 +184,12 @@ class World:
         for target in (self._brick, self._marker):
             if target is not None:
                 self._place(target, self._goal)
+        self._bodies = self._read_bodies()
+        self._bodies_move = (
+            bool(self._objects)
+            or placement.path is not None
+            or any(map(self._is_simulated, self._present))
+        )
 
     def _look_ahead(self, substeps: int) -> list[tuple[list[Vector], ...]]:
         """The obstacles' ways through the next substeps.
@@ -223,7 +235,6 @@ class World:
         forces = [0.0] * len(self._obstacles)
         measurements = []
         ways = None if self._placement.path is None else self._look_ahead(substeps)
-        senses = self._sensors.sensing != Sensing()
         for substep in range(1, substeps + 1):
             pybullet.stepSimulation(physicsClientId=client)
             for index in self._present:
@@ -237,7 +248,7 @@ class World:
             # Bullet has looked for contacts before it moved the arm: now the obstacles move too.
             if ways is not None:
                 self._follow(*ways[substep])
-            if senses:
+            if self._senses:
                 measurements.append(self.measure())
         self._substeps += substeps
         return distances, forces, measurements
@@ -248,7 +259,7 @@ class World:
         limits = {"forces": self._arm.effort[:count]} if self._scene.motor_limits else {}
         pybullet.setJointMotorControlArray(
             self._arm.body,
-            (self._arm.joints + self._arm.fingers)[:count],
+            self._driven[:count],
             pybullet.POSITION_CONTROL,
             targetPositions=targets,
             positionGains=[gain] * count,
@@ -258,39 +269,48 @@ class World:
 
     def read(self, *, fresh: bool = False) -> list[float]:
         """Returns the state as one flat row, in the order of :meth:`read_shapes`."""
-        states = self._joint_states()
+        positions, velocities, *_ = zip(*self._joint_states(), strict=True)
         link = self._link_state(fresh=fresh or self._scene.fresh_links)
-        arm = len(self._arm.joints)
-        row = [
-            *(state[0] for state in states[:arm]),
-            *(state[1] for state in states[:arm]),
-            *(state[0] for state in states[arm:]),
+        goal = self._goal if self._brick is None else self._pose(self._brick)[0]
+        if self._bodies_move:
+            self._bodies = self._read_bodies()
+        return [
+            *positions,
+            *velocities,
             *link[4],
             *link[5],
-            *velocity_at(link[4], link[0], link[6], link[7]),
+            *link[0],
+            *link[6],
+            *link[7],
+            *goal,
+            *self._bodies,
         ]
-        row += self._goal if self._brick is None else self._pose(self._brick)[0]
+
+    def _read_bodies(self) -> list[float]:
         objects = [(*self._pose(body), *self._velocity(body)) for body in self._objects]
         obstacles = [
             (*self._obstacle_pose(index), *self._obstacle_velocity(index))
             for index in range(len(self._obstacles))
         ]
-        for bodies in (objects, obstacles):
-            for part in range(4):
-                for body in bodies:
-                    row += body[part]
-        return row
+        return [
+            number
+            for bodies in (objects, obstacles)
+            for part in range(len(_BODY_PARTS))
+            for body in bodies
+            for number in body[part]
+        ]
 
     def read_shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the parts of a row that :meth:`read` returns."""
-        joints = len(self._arm.joints)
+        joints, fingers = (len(self._arm.joints),), (len(self._arm.fingers),)
         shapes: dict[str, tuple[int, ...]] = {
-            "joint_position": (joints,),
-            "joint_velocity": (joints,),
-            "finger_position": (len(self._arm.fingers),),
+            "joint_position": joints,
+            "finger_position": fingers,
+            "joint_velocity": joints,
+            "finger_velocity": fingers,
             "ee_position": (3,),
             "ee_orientation": (4,),
-            "ee_velocity": (3,),
+            **dict.fromkeys(TOOL_MOTION, (3,)),
             "goal": (3,),
         }
         for kind, bodies in (("object", self._objects), ("obstacle", self._obstacles)):
@@ -394,14 +414,12 @@ class World:
         return link_state(self._client, self._arm.body, self._arm.ee, fresh=fresh)
 
     def _joint_states(self) -> tuple[tuple[float, float], ...]:
-        return pybullet.getJointStates(
-            self._arm.body, self._arm.joints + self._arm.fingers, physicsClientId=self._client
-        )
+        return pybullet.getJointStates(self._arm.body, self._driven, physicsClientId=self._client)
 
     def _set_joints(self, positions: Vector) -> None:
         pybullet.resetJointStatesMultiDof(
             self._arm.body,
-            self._arm.joints + self._arm.fingers,
+            self._driven,
             [[angle] for angle in positions],
             [[0.0] for _ in positions],
             physicsClientId=self._client,

@@ -72,6 +72,7 @@ def paper_env(action: ActionMode = PAPER_CARTESIAN, **kwargs: Any) -> ArmEnv:
             furniture=(("plane.urdf", (0, 0, -0.65)), ("table/table.urdf", (0.5, 0, -0.65))),
             target_urdf="lego/lego.urdf",
             free_fingers=True,
+            merged_links=False,
             motor_limits=False,
             motor_gain=0.1,
             urdf_inertia=True,

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import pybullet
 
 from torchrl_safe.envs.bodies import LoadedArm
-from torchrl_safe.envs.state import Sensing
+from torchrl_safe.envs.state import Array, Sensing
 
 Vector = Sequence[float]
+Number = TypeVar("Number", float, Array)
 
 
 class MovingBody(NamedTuple):
@@ -152,9 +153,15 @@ def link_state(client: int, body: int, link: int, *, fresh: bool) -> tuple:
 
 
 def velocity_at(
-    point: Vector, centre: Vector, linear: Vector, angular: Vector
-) -> tuple[float, float, float]:
-    """Velocity of a point of a body whose centre of mass has the given velocities."""
+    point: Sequence[Number],
+    centre: Sequence[Number],
+    linear: Sequence[Number],
+    angular: Sequence[Number],
+) -> tuple[Number, Number, Number]:
+    """Velocity of a point of a body whose centre of mass has the given velocities.
+
+    Each is three numbers, or three arrays for many bodies at once.
+    """
     x, y, z = (p - c for p, c in zip(point, centre, strict=True))
     wx, wy, wz = angular
     return (

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import pybullet_data
 
 from torchrl_safe.envs.arms import ArmModel, Gripper
+from torchrl_safe.envs.urdf_merge import merge_fixed_links
 
 _PACKAGE = "package://"
 # What the names of an attached gripper begin with, so that they are not those of the arm.
@@ -29,7 +30,7 @@ class PreparedUrdf(NamedTuple):
     tool_link: str
 
 
-def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool) -> PreparedUrdf:
+def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool, merge: bool) -> PreparedUrdf:
     """Returns the URDF of an arm with its gripper.
 
     Args:
@@ -37,6 +38,7 @@ def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool) -> Prepared
         visuals: keep the visual shapes, which cost memory and load time.
         fix_fingers: fix every joint that does not move the tool: a Panda's two fingers are
             half of the cost of a physics step.
+        merge: make one link of those that fixed joints hold together; the tool's frame stays.
 
     Raises:
         ValueError: if a file is missing or not XML, a mesh is missing or there is no such link.
@@ -51,6 +53,8 @@ def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool) -> Prepared
         for joint in root.findall("joint"):
             if joint.get("name") not in chain:
                 joint.set("type", "fixed")
+    if merge:
+        merge_fixed_links(root, keep=tool_link)
     return PreparedUrdf(ElementTree.tostring(root, encoding="unicode"), chain, tool_link)
 
 
