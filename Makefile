@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow paper sweep profile gallery lint format type clean
+.PHONY: train test test-slow compare paper sweep profile gallery lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -16,6 +16,9 @@ test: $(READY)  ## everything but the slow tests, on two cores
 
 test-slow: $(READY)  ## every combination, and the tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m slow $(ARGS)
+
+compare: $(READY)  ## every algorithm on the same task; goes on where it was stopped
+	$(BIN)/python -m experiments.compare $(ARGS)
 
 paper: $(READY)  ## Table 1 and Figure 2 of the paper, run again; goes on where it was stopped
 	$(BIN)/python -m experiments.paper $(ARGS)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import multiprocessing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +34,14 @@ def run_grid(
         jobs: the arguments of each job by the file its result is kept in.
         workers: processes side by side.
         name: what the progress bar is called.
+
+    Raises:
+        ValueError: if there is a result of a run with other arguments.
     """
     for path in jobs:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            _check_same(path, jobs[path])
     todo = missing(jobs)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context) as pool:
@@ -43,11 +50,52 @@ def run_grid(
             if done.exception() is not None:
                 pool.shutdown(cancel_futures=True)
                 done.result()
-    return [json.loads(path.read_text()) for path in jobs]
+    return [json.loads(path.read_text())["result"] for path in jobs]
+
+
+def save_results(out: Path, config: Any, runs: Sequence[dict[str, Any]], table: str) -> None:
+    """Writes ``results.json`` and ``table.md``, and shows the table.
+
+    Args:
+        out: folder to write to.
+        config: a dataclass, the settings of the grid.
+        runs: what the jobs returned.
+        table: Markdown.
+    """
+    results = {
+        "config": dataclasses.asdict(config),
+        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
+        "runs": runs,
+    }
+    (out / "results.json").write_text(json.dumps(results, default=str))
+    (out / "table.md").write_text(table)
+    print(f"\n{table}\nResults are in {out}.")
 
 
 def _run_and_keep(run: Callable[..., dict[str, Any]], path: Path, arguments: Any) -> None:
     # A program that is stopped leaves no half of a file behind.
     unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(json.dumps(run(*arguments)))
+    kept = {"arguments": _plain(arguments), "result": run(*arguments)}
+    unfinished.write_text(json.dumps(kept))
     unfinished.rename(path)
+
+
+def _check_same(path: Path, arguments: Any) -> None:
+    kept, wanted = json.loads(path.read_text())["arguments"], _plain(arguments)
+    if kept != wanted:
+        raise ValueError(
+            f"out must be a folder of the same settings, got {str(path)!r} with {kept} instead of "
+            f"{wanted}."
+        )
+
+
+def _plain(arguments: Any) -> Any:
+    """Arguments as JSON gives them back, without paths, which say where and not what."""
+
+    def describe(value: Any) -> Any:
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            fields = dataclasses.asdict(value).items()
+            return {name: part for name, part in fields if not isinstance(part, Path)}
+        return str(value)
+
+    return json.loads(json.dumps(arguments, default=describe))

@@ -97,7 +97,7 @@ class OnPolicyLearner:
         groups = [{"params": critics, "lr": 2 * learning_rate}]
         if actor_step is None:
             groups.append({"params": self.policy, "lr": learning_rate})
-        self.optimizer = torch.optim.Adam(groups)
+        self.optimizer = torch.optim.Adam(groups, fused=True)
         self.schedule = torch.optim.lr_scheduler.LinearLR(
             self.optimizer, 1.0, 0.0, total_iters=batches
         )
@@ -156,7 +156,7 @@ class ReplayLearner:
         self.loss, self.steps_per_update = loss, steps_per_update
         self.targets = SoftUpdate(loss, tau=0.005)
         self.policy = list(actor.parameters())
-        self.optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate)
+        self.optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate, fused=True)
         self.buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(capacity), sampler=RandomSampler(), batch_size=minibatch
         )

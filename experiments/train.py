@@ -312,6 +312,11 @@ def train_and_evaluate(
     }
 
 
+def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
+    """One run of a grid: only what can be kept as JSON."""
+    return train_and_evaluate(config, algorithm, progress=False)[1]
+
+
 def main(config: Config) -> None:
     """Trains and evaluates each algorithm, then writes the comparison."""
     if config.out.exists() and any(config.out.iterdir()):

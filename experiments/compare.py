@@ -1,0 +1,126 @@
+"""Every algorithm on the same task: ``make compare``.
+
+Trains each as ``make train`` does, with its defaults and as many control steps, for several seeds.
+Stopped and started again, it goes on with the runs that are missing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from itertools import product
+from pathlib import Path
+from typing import Any, get_args
+
+import matplotlib.pyplot as plt
+import torch
+import tyro
+
+from experiments import train
+from experiments.grid import run_grid, save_results
+from torchrl_safe.metrics import mean, worst_seed
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train every algorithm and compare them."""
+
+    algorithms: tuple[train.AlgorithmName, ...] = get_args(train.AlgorithmName)
+    """What to train."""
+    action: train.Action = "cartesian"
+    """What an action moves."""
+    cost_limit: float = train.Config.cost_limit
+    """Limit of the expected cost of an episode."""
+    seeds: int = 3
+    """Runs of each algorithm, with seeds from 0."""
+    frames: int = train.Config.frames
+    """Control steps to train for."""
+    eval_episodes: int = 256
+    """Episodes of the final evaluation of each run, with the deterministic policy."""
+    workers: int = os.cpu_count() or 1
+    """Runs side by side."""
+    out: Path = Path("runs/compare")
+    """Folder of results; runs that are already there are not run again."""
+
+
+def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]:
+    """What to run, by the file of its results."""
+    return {
+        config.out / f"{algorithm}-{seed}.json": (
+            train.Config(
+                action=config.action,
+                cost_limit=config.cost_limit,
+                seed=seed,
+                frames=config.frames,
+                eval_episodes=config.eval_episodes,
+                workers=1,
+                out=config.out / "runs" / str(seed),
+            ),
+            algorithm,
+        )
+        for seed, algorithm in product(range(config.seeds), config.algorithms)
+    }
+
+
+def table(runs: list[dict[str, Any]], cost_limit: float) -> str:
+    """Returns a Markdown table with a row for each algorithm."""
+    lines = [
+        "| algorithm | cost (95 % over seeds) | worst seed | seeds within the limit | success "
+        "| lowest | return | minutes of training |",
+        "|---" * 8 + "|",
+    ]
+    for algorithm in dict.fromkeys(run["algorithm"] for run in runs):
+        mine = [run for run in runs if run["algorithm"] == algorithm]
+        costs = torch.tensor([run["episodes"]["episode_cost"] for run in mine]).squeeze(-1)
+        middle = mean(costs.unsqueeze(-1), resample="seeds" if len(mine) > 1 else "episodes")
+        success = [run["evaluation"]["success"][0] for run in mine]
+        returns = [run["evaluation"]["return"][0] for run in mine]
+        lines.append(
+            f"| {algorithm} "
+            f"| {middle.value.item():.2f} [{middle.low.item():.2f}, {middle.high.item():.2f}] "
+            f"| {worst_seed(costs.unsqueeze(-1)).value.item():.2f} "
+            f"| {(costs.mean(1) <= cost_limit).sum()}/{len(mine)} "
+            f"| {sum(success) / len(mine):.1%} | {min(success):.1%} "
+            f"| {sum(returns) / len(mine):.2f} "
+            f"| {sum(run['seconds'] for run in mine) / len(mine) / 60:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def plot(runs: list[dict[str, Any]], cost_limit: float, path: Path) -> None:
+    """Draws return against cost: the mean of each algorithm, named, and its seeds."""
+    figure, axis = plt.subplots(figsize=(7.4, 5.2))
+    for index, algorithm in enumerate(dict.fromkeys(run["algorithm"] for run in runs)):
+        colour = plt.get_cmap("tab20")(index)
+        points = torch.tensor(
+            [
+                [run["evaluation"][name][0] for name in ("cost/collision", "return")]
+                for run in runs
+                if run["algorithm"] == algorithm
+            ]
+        )
+        axis.plot(*points.T, ".", color=colour, alpha=0.5)
+        axis.plot(*points.mean(0), "o", color=colour, label=algorithm)
+    axis.axvline(cost_limit, color="black", ls="--", label="limit")
+    axis.set(xlabel="evaluated episode cost", ylabel="evaluated return", xscale="symlog")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=7, ncols=2)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main(config: Config) -> None:
+    """Runs what is missing, then writes table, figure and results.json."""
+    grid = jobs(config)
+    results = run_grid(train.run, grid, workers=config.workers, name="compare")
+    runs = [
+        {"algorithm": algorithm, "seed": settings.seed, **result}
+        for (settings, algorithm), result in zip(grid.values(), results, strict=True)
+    ]
+    save_results(config.out, config, runs, table(runs, config.cost_limit))
+    plot(runs, config.cost_limit, config.out / "compare.png")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
