@@ -8,10 +8,8 @@ Stopped and started again, it goes on with the runs that are missing.
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
-from importlib.metadata import version
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,7 @@ import numpy as np
 import tyro
 
 from experiments import train
-from experiments.grid import run_grid
+from experiments.grid import run_grid, save_results
 from experiments.report import COLOURS
 
 RULES: tuple[train.MultiplierRule, ...] = ("dual-ascent", "pid")
@@ -48,34 +46,33 @@ class Config:
     """Folder of results; runs that are already there are not run again."""
 
 
-def run(config: Config, rule: train.MultiplierRule, value: float, seed: int) -> dict[str, Any]:
-    """Trains and evaluates one policy; ``value`` is the multiplier, or the rule's cost limit."""
-    fixed = rule == "fixed"
-    settings = train.Config(
-        action=config.action,
-        multiplier_rule=rule,
-        multiplier_init=value if fixed else 0.0,
-        cost_limit=0.0 if fixed else value,
-        seed=seed,
-        frames=config.frames,
-        eval_episodes=config.eval_episodes,
-        workers=1,
-        out=config.out / "runs" / f"{rule}-{value:g}-{seed}",
-    )
-    _, result = train.train_and_evaluate(settings, "ppo-lagrangian", progress=False)
-    return {"rule": rule, "value": value, "seed": seed, **result}
-
-
-def jobs(config: Config) -> dict[Path, tuple[Config, train.MultiplierRule, float, int]]:
+def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]:
     """What to run, by the file of its results."""
-    settings: list[tuple[train.MultiplierRule, float]] = [
+    return {
+        config.out / f"{rule}-{value:g}-{seed}.json": (
+            train.Config(
+                action=config.action,
+                multiplier_rule=rule,
+                multiplier_init=value if rule == "fixed" else 0.0,
+                cost_limit=0.0 if rule == "fixed" else value,
+                seed=seed,
+                frames=config.frames,
+                eval_episodes=config.eval_episodes,
+                workers=1,
+                out=config.out / "runs" / f"{rule}-{value:g}-{seed}",
+            ),
+            "ppo-lagrangian",
+        )
+        for seed, (rule, value) in product(range(config.seeds), settings(config))
+    }
+
+
+def settings(config: Config) -> list[tuple[train.MultiplierRule, float]]:
+    """Each rule with the multiplier it keeps, or with the cost limit it is given."""
+    fixed: list[tuple[train.MultiplierRule, float]] = [
         ("fixed", value) for value in config.multipliers
     ]
-    settings += product(RULES, config.limits)
-    return {
-        config.out / f"{rule}-{value:g}-{seed}.json": (config, rule, value, seed)
-        for seed, (rule, value) in product(range(config.seeds), settings)
-    }
+    return fixed + list(product(RULES, config.limits))
 
 
 def points(runs: list[dict[str, Any]]) -> dict[tuple[str, float], np.ndarray]:
@@ -110,7 +107,7 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
         axis.plot(fixed[value][:, 1], fixed[value][:, 0], ".", color="grey", alpha=0.5)
     limits = sorted({value for rule, value in found if rule != "fixed"})
     for rule, colour in zip(RULES, COLOURS[1:], strict=False):
-        for limit, marker in zip(limits, "sD^v", strict=False):
+        for limit, marker in zip(limits, cycle("sD^vP*"), strict=False):
             rows = found[rule, limit]
             label = f"{rule}, limit {limit:g}"
             axis.plot(rows[:, 1], rows[:, 0], marker, color=colour, ls="", label=label, alpha=0.7)
@@ -126,17 +123,14 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
 
 def main(config: Config) -> None:
     """Runs what is missing, then writes table, figure and results.json."""
-    runs = run_grid(run, jobs(config), workers=config.workers, name="profile")
-    results = {
-        "config": dataclasses.asdict(config),
-        "defaults": dataclasses.asdict(train.Config()),
-        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
-        "runs": runs,
-    }
-    (config.out / "results.json").write_text(json.dumps(results, default=str))
-    (config.out / "table.md").write_text(table(runs))
+    results = run_grid(train.run, jobs(config), workers=config.workers, name="profile")
+    names = product(range(config.seeds), settings(config))
+    runs = [
+        {"rule": rule, "value": value, "seed": seed, **result}
+        for (seed, (rule, value)), result in zip(names, results, strict=True)
+    ]
+    save_results(config.out, config, runs, table(runs))
     plot(runs, config.out / "profile.png")
-    print(f"\n{table(runs)}\nResults are in {config.out}.")
 
 
 if __name__ == "__main__":

@@ -8,9 +8,7 @@ Stopped and started again, it goes on with the runs that are missing.
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
-from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from time import perf_counter
@@ -28,7 +26,7 @@ from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
 from experiments.evaluation import evaluate
-from experiments.grid import run_grid
+from experiments.grid import run_grid, save_results
 from experiments.report import COLOURS
 from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ActionMode, paper_env
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
@@ -111,7 +109,7 @@ def make_agent(env: EnvBase) -> tuple[ProbabilisticActor, PPOLagrangianLoss]:
     return actor, loss
 
 
-def run(config: Config, cell: str, seed: int) -> dict[str, Any]:
+def run(cell: str, seed: int, epochs: int, cost_limit: float, eval_episodes: int) -> dict[str, Any]:
     """Trains and evaluates one policy."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
@@ -125,7 +123,7 @@ def run(config: Config, cell: str, seed: int) -> dict[str, Any]:
         loss.lagrange_multiplier.fill_(1.0)
         updater = DualAscent(
             loss,
-            cost_limit=config.cost_limit,
+            cost_limit=cost_limit,
             lr=0.05,
             optimizer=torch.optim.Adam,
             parametrization=SoftplusTransform(),
@@ -138,7 +136,7 @@ def run(config: Config, cell: str, seed: int) -> dict[str, Any]:
         env,
         actor,
         frames_per_batch=1000,
-        total_frames=1000 * config.epochs,
+        total_frames=1000 * epochs,
         reset_at_each_iter=True,
         auto_register_policy_transforms=False,
     )
@@ -159,8 +157,8 @@ def run(config: Config, cell: str, seed: int) -> dict[str, Any]:
             }
         )
     collector.shutdown()
-    test = make_env(action, min(20, config.eval_episodes), seed)
-    episodes = evaluate(test, actor, config.eval_episodes, seed=seed + 1_000_000)
+    test = make_env(action, min(20, eval_episodes), seed)
+    episodes = evaluate(test, actor, eval_episodes, seed=seed + 1_000_000)
     test.close()
     return {
         "cell": cell,
@@ -196,10 +194,11 @@ def update(
         policy_optimizer.zero_grad()
 
 
-def jobs(config: Config) -> dict[Path, tuple[Config, str, int]]:
+def jobs(config: Config) -> dict[Path, tuple[str, int, int, float, int]]:
     """What to run, by the file of its results."""
+    settings = (config.epochs, config.cost_limit, config.eval_episodes)
     return {
-        config.out / f"{cell.replace(' ', '-')}-{seed}.json": (config, cell, seed)
+        config.out / f"{cell.replace(' ', '-')}-{seed}.json": (cell, seed, *settings)
         for seed, cell in product(range(config.seeds), CELLS)
     }
 
@@ -257,15 +256,8 @@ def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:
 def main(config: Config) -> None:
     """Runs what is missing, then writes table, figure and results.json."""
     runs = run_grid(run, jobs(config), workers=config.workers, name="paper")
-    results = {
-        "config": dataclasses.asdict(config),
-        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
-        "runs": runs,
-    }
-    (config.out / "results.json").write_text(json.dumps(results, default=str))
-    (config.out / "table.md").write_text(table(runs))
+    save_results(config.out, config, runs, table(runs))
     plot(runs, config.out / "curves.png", config.cost_limit)
-    print(f"\n{table(runs)}\nResults are in {config.out}.")
 
 
 def _over_seeds(values: list[float], digits: int = 1) -> str:

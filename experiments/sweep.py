@@ -7,9 +7,8 @@ and PPO for comparison. Stopped and started again, it goes on with the runs that
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
-from importlib.metadata import version
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import torch
 import tyro
 
 from experiments import train
-from experiments.grid import run_grid
+from experiments.grid import run_grid, save_results
 from experiments.report import COLOURS
 from torchrl_safe.metrics import mean, worst_seed
 
@@ -51,31 +50,30 @@ class Config:
     """Folder of results; runs that are already there are not run again."""
 
 
-def run(config: Config, action: train.Action, limit: float | None, seed: int) -> dict[str, Any]:
-    """Trains and evaluates one policy; without a limit, with PPO."""
-    algorithm: train.AlgorithmName = "ppo" if limit is None else "ppo-lagrangian"
-    settings = train.Config(
-        paper=config.paper,
-        action=action,
-        observation=config.observation,
-        cost_limit=limit or 0.0,
-        seed=seed,
-        frames=config.frames,
-        eval_episodes=config.eval_episodes,
-        workers=1,
-        out=config.out / "runs" / _name(action, limit, seed),
-    )
-    _, result = train.train_and_evaluate(settings, algorithm, progress=False)
-    return {"action": action, "limit": limit, "seed": seed, **result}
-
-
-def jobs(config: Config) -> dict[Path, tuple[Config, train.Action, float | None, int]]:
+def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]:
     """What to run, by the file of its results."""
-    limits = (*config.limits, None)
     return {
-        config.out / f"{_name(action, limit, seed)}.json": (config, action, limit, seed)
-        for seed, action, limit in product(range(config.seeds), config.actions, limits)
+        config.out / f"{_name(action, limit, seed)}.json": (
+            train.Config(
+                paper=config.paper,
+                action=action,
+                observation=config.observation,
+                cost_limit=limit or 0.0,
+                seed=seed,
+                frames=config.frames,
+                eval_episodes=config.eval_episodes,
+                workers=1,
+                out=config.out / "runs" / _name(action, limit, seed),
+            ),
+            "ppo" if limit is None else "ppo-lagrangian",
+        )
+        for seed, action, limit in names(config)
     }
+
+
+def names(config: Config) -> Iterable[tuple[int, train.Action, float | None]]:
+    """Seed, action and limit of each run; no limit stands for PPO."""
+    return product(range(config.seeds), config.actions, (*config.limits, None))
 
 
 def episode_costs(runs: list[dict[str, Any]]) -> torch.Tensor:
@@ -147,17 +145,13 @@ def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
 
 def main(config: Config) -> None:
     """Runs what is missing, then writes table, figure and results.json."""
-    runs = run_grid(run, jobs(config), workers=config.workers, name="sweep")
-    results = {
-        "config": dataclasses.asdict(config),
-        "defaults": dataclasses.asdict(train.Config()),
-        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
-        "runs": runs,
-    }
-    (config.out / "results.json").write_text(json.dumps(results, default=str))
-    (config.out / "table.md").write_text(table(runs, config))
+    results = run_grid(train.run, jobs(config), workers=config.workers, name="sweep")
+    runs = [
+        {"action": action, "limit": limit, "seed": seed, **result}
+        for (seed, action, limit), result in zip(names(config), results, strict=True)
+    ]
+    save_results(config.out, config, runs, table(runs, config))
     plot(runs, config, config.out / "sweep.png")
-    print(f"\n{table(runs, config)}\nResults are in {config.out}.")
 
 
 def _name(action: train.Action, limit: float | None, seed: int) -> str:

@@ -1,11 +1,13 @@
 """Grids of runs: every job once, side by side, and nothing half written."""
 
+import dataclasses
 import json
 import os
+from pathlib import Path
 
 import pytest
 
-from experiments.grid import missing, run_grid
+from experiments.grid import missing, run_grid, save_results
 
 
 def square(number, folder):
@@ -34,4 +36,42 @@ def test_a_job_that_fails_leaves_the_others(tmp_path):
     with pytest.raises(ArithmeticError, match="no root for -1"):
         run_grid(square, make_jobs(tmp_path, 2, -1), workers=1, name="squares")
     assert [path.name for path in (tmp_path / "results").iterdir()] == ["2.json"]
-    assert json.loads((tmp_path / "results" / "2.json").read_text()) == {"square": 4}
+    kept = json.loads((tmp_path / "results" / "2.json").read_text())
+    assert kept["result"] == {"square": 4}
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    factor: float
+    out: Path
+
+
+def multiply(settings, number):
+    return {"product": settings.factor * number}
+
+
+def test_results_of_other_settings_are_refused(tmp_path):
+    """Where they are kept is no such setting."""
+
+    def run(factor, folder):
+        return run_grid(
+            multiply,
+            {tmp_path / "a.json": (Settings(factor, folder), 3)},
+            workers=1,
+            name="products",
+        )
+
+    assert run(2.0, tmp_path) == [{"product": 6.0}]
+    assert run(2.0, tmp_path / "elsewhere") == [{"product": 6.0}]
+    with pytest.raises(ValueError, match=r"out must be .* 'factor': 2.0\}.* instead of .*: 5.0\}"):
+        run(5.0, tmp_path)
+
+
+def test_results_are_written_with_settings_and_versions(tmp_path, capsys):
+    save_results(tmp_path, Settings(2.0, tmp_path), [{"product": 6.0}], "| a |")
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["config"] == {"factor": 2.0, "out": str(tmp_path)}
+    assert results["runs"] == [{"product": 6.0}]
+    assert set(results["versions"]) == {"torch", "torchrl", "pybullet"}
+    assert (tmp_path / "table.md").read_text() == "| a |"
+    assert "| a |" in capsys.readouterr().out

@@ -6,7 +6,7 @@ import json
 import pytest
 from PIL import Image
 
-from experiments import multiplier_profile, sweep
+from experiments import compare, multiplier_profile, sweep
 from experiments.grid import missing
 
 SMALL = {"seeds": 1, "frames": 4096, "eval_episodes": 32, "workers": 2}
@@ -94,3 +94,41 @@ def test_profile_shows_fixed_multipliers_and_rules(tmp_path):
     multiplier_profile.plot(runs, tmp_path / "profile.png")
     with Image.open(tmp_path / "profile.png") as image:
         assert image.width > 500
+
+
+def test_comparison_has_a_row_for_each_algorithm(tmp_path):
+    def end(algorithm, seed, costs, success):
+        return {
+            "algorithm": algorithm,
+            "seed": seed,
+            "seconds": 60.0 * (1 + seed),
+            "evaluation": {
+                "success": [success, 0, 1], "return": [-2.0 - seed], "cost/collision": [costs[0]],
+            },
+            "episodes": {"episode_cost": [[float(cost)] for cost in costs]},
+        }  # fmt: skip
+
+    runs = [
+        end("ppo", 0, [4, 4], 1.0), end("cpo", 0, [0, 1], 1.0),
+        end("ppo", 1, [6, 6], 1.0), end("cpo", 1, [1, 1], 0.5),
+    ]  # fmt: skip
+    rows = compare.table(runs, cost_limit=0.5).splitlines()[2:]
+    assert rows == [
+        "| ppo | 5.00 [4.00, 6.00] | 6.00 | 0/2 | 100.0% | 100.0% | -2.50 | 1.5 |",
+        "| cpo | 0.75 [0.50, 1.00] | 1.00 | 1/2 | 75.0% | 50.0% | -2.50 | 1.5 |",
+    ]
+    compare.plot(runs, 0.5, tmp_path / "compare.png")
+    with Image.open(tmp_path / "compare.png") as image:
+        assert image.width > 500
+
+
+@pytest.mark.slow
+def test_comparison_trains_what_it_is_told(tmp_path):
+    config = compare.Config(**SMALL, algorithms=("ppo", "cpo"), out=tmp_path)
+    compare.main(config)
+    runs = json.loads((tmp_path / "results.json").read_text())["runs"]
+    assert [run["algorithm"] for run in runs] == ["ppo", "cpo"]
+    assert not missing(compare.jobs(config))
+    assert [path.name for path in missing(compare.jobs(dataclasses.replace(config, seeds=2)))] == [
+        "ppo-1.json", "cpo-1.json",
+    ]  # fmt: skip
