@@ -14,9 +14,9 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss
+from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, SoftUpdate
 from torchrl.record import CSVLogger
-from torchrl.trainers.algorithms import PPOTrainer
+from torchrl.trainers.algorithms import PPOTrainer, SACTrainer
 
 from torchrl_safe.envs import ArmEnv, Collision
 from torchrl_safe.objectives import (
@@ -29,6 +29,7 @@ from torchrl_safe.objectives import (
     P3OLoss,
     PIDControl,
     PPOLagrangianLoss,
+    SACLagrangianLoss,
     TrustRegionLoss,
     ViolationUpdater,
 )
@@ -51,13 +52,7 @@ class Arm:
         arm = ArmEnv(num_envs=WORLDS, costs=self.costs, max_episode_steps=STEPS, seed=seed)
         env = TransformedEnv(arm, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
         observations = env.observation_spec["observation"].shape[-1]
-        policy = nn.Sequential(MLP(observations, 6, num_cells=[8]), NormalParamExtractor())
-        actor = ProbabilisticActor(
-            TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
-        )
+        actor = make_actor(observations)
         critic = ValueOperator(MLP(observations, 1, num_cells=[8]), ["observation"])
         cost_critic = ValueOperator(
             MLP(observations, 2, num_cells=[8]), ["observation"], ["cost_value"]
@@ -86,6 +81,16 @@ class Arm:
 
     def safe_trainer(self, **settings):
         return self.trainer(updater=self.updater, cost_names=list(self.costs), **settings)
+
+
+def make_actor(observations):
+    policy = nn.Sequential(MLP(observations, 6, num_cells=[8]), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
 
 
 def make_collector(env, actor, frames):
@@ -256,6 +261,44 @@ def test_the_hook_in_a_ppo_trainer(make_arm, tmp_path):
     # The loss has seen what the hook has written, and its cost critic learns.
     assert read_log(tmp_path, "lagrange_multiplier_1") == multipliers
     assert read_log(tmp_path, "loss_cost_critic")[0][1] > 0
+
+
+def test_the_hook_in_a_sac_trainer(tmp_path):
+    """Off policy it is the same hook: costs of 5 in each episode again, one cost this time."""
+    torch.manual_seed(0)
+    arm = ArmEnv(num_envs=WORLDS, costs={"always": always}, max_episode_steps=STEPS, seed=0)
+    env = TransformedEnv(arm, RewardSum(["reward", "cost"], ["reward_sum", "episode_cost"]))
+    observations = env.observation_spec["observation"].shape[-1]
+    actor = make_actor(observations)
+    inputs = {"in_keys": ["observation", "action"]}
+    loss = SACLagrangianLoss(
+        actor,
+        ValueOperator(MLP(observations + 3, 1, num_cells=[8]), **inputs),
+        ValueOperator(
+            MLP(observations + 3, 1, num_cells=[8]), out_keys=["state_action_cost_value"], **inputs
+        ),
+        target_entropy=-3.0,
+    )
+    logger = CSVLogger("run", log_dir=str(tmp_path))
+    collector = make_collector(env, actor, FRAMES)
+    trainer = SACTrainer(
+        collector=collector,
+        total_frames=2 * FRAMES,
+        frame_skip=1,
+        optim_steps_per_batch=2,
+        loss_module=loss,
+        optimizer=torch.optim.Adam(loss.parameters(), lr=1e-3),
+        target_net_updater=SoftUpdate(loss, eps=0.99),
+        replay_buffer=TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=20),
+        logger=logger,
+        log_interval=0,
+        progress_bar=False,
+    )
+    updater = DualAscent(loss, cost_limit=2.0, lr=0.1)
+    MultiplierHook(updater, cost_names=["always"]).register(trainer)
+    trainer.train()
+    values = [value for _, value in read_log(tmp_path, "lagrange_multiplier/always")]
+    assert values == pytest.approx([0.3, 0.6])
 
 
 def plain_loop(arm, batches):

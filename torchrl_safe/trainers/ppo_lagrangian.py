@@ -59,16 +59,46 @@ class PPOLagrangianTrainer(PPOTrainer):
     of the updater too, and ``load_from_file`` gives it back.
 
     Examples:
-        >>> trainer = PPOLagrangianTrainer(  # doctest: +SKIP
-        ...     collector=collector,
-        ...     total_frames=128_000,
+        >>> import torch
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement
+        >>> from torchrl.data import TensorDictReplayBuffer
+        >>> from torchrl.envs import RewardSum, TransformedEnv
+        >>> from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
+        >>> arm = ArmEnv(num_envs=4, max_episode_steps=5)
+        >>> env = TransformedEnv(arm, RewardSum(["reward", "cost"], ["reward_sum", "episode_cost"]))
+        >>> policy = torch.nn.Sequential(torch.nn.Linear(40, 6), NormalParamExtractor())
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     distribution_class=TanhNormal,
+        ...     return_log_prob=True,
+        ... )
+        >>> critic = ValueOperator(torch.nn.Linear(40, 1), ["observation"])
+        >>> cost_critic = ValueOperator(torch.nn.Linear(40, 1), ["observation"], ["cost_value"])
+        >>> loss = PPOLagrangianLoss(actor, critic, cost_critic, entropy_bonus=False)
+        >>> trainer = PPOLagrangianTrainer(
+        ...     collector=Collector(
+        ...         env, actor, frames_per_batch=40, auto_register_policy_transforms=False
+        ...     ),
+        ...     total_frames=80,
         ...     loss_module=loss,
         ...     updater=DualAscent(loss, cost_limit=0.5, lr=0.2),
-        ...     optimizer=optimizer,
-        ...     replay_buffer=buffer,
-        ...     cost_names=env.cost_names,
+        ...     optimizer=torch.optim.Adam(loss.parameters(), lr=5e-4),
+        ...     replay_buffer=TensorDictReplayBuffer(
+        ...         storage=LazyTensorStorage(40),
+        ...         sampler=SamplerWithoutReplacement(),
+        ...         batch_size=20,
+        ...     ),
+        ...     cost_names=arm.cost_names,
+        ...     progress_bar=False,
         ... )
-        >>> trainer.train()  # doctest: +SKIP
+        >>> trainer.train()
+        >>> trainer.collected_frames
+        80
     """
 
     _algo_name = "PPO-Lagrangian"
