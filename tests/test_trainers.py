@@ -315,21 +315,32 @@ def plain_loop(arm, batches):
                 arm.optimizer.zero_grad()
 
 
-def test_the_trainer_is_the_plain_loop(make_arm):
+def with_the_hook(arm, batches):
+    trainer = arm.trainer(PPOTrainer, batches, gae=arm.loss.estimate_advantages)
+    MultiplierHook(arm.updater).register(trainer)
+    return trainer
+
+
+@pytest.mark.parametrize("make", [Arm.safe_trainer, with_the_hook], ids=["trainer", "hook"])
+def test_a_trainer_is_the_plain_loop(make_arm, make):
     """All parameters, the multipliers and Adam's state, bit for bit."""
     ours, plain = make_arm(), make_arm()
     before = [parameter.clone() for parameter in ours.loss.parameters()]
-    ours.safe_trainer(batches=3).train()
+    make(ours, batches=3).train()
     plain_loop(plain, 3)
-    state, expected = ours.loss.state_dict(), plain.loss.state_dict()
+    assert_same_state(ours.loss, plain.loss)
+    assert ours.loss.lagrange_multiplier[1] == pytest.approx(0.9)
+    assert not any(map(torch.equal, before, ours.loss.parameters()))
+    moments = [arm.optimizer.state_dict()["state"] for arm in (ours, plain)]
+    for mine, its in zip(moments[0].values(), moments[1].values(), strict=True):
+        assert torch.equal(mine["exp_avg_sq"], its["exp_avg_sq"])
+
+
+def assert_same_state(loss, expected):
+    state, expected = loss.state_dict(), expected.state_dict()
     assert state.keys() == expected.keys()
     for key, value in expected.items():
         assert torch.equal(torch.as_tensor(state[key]), torch.as_tensor(value)), key
-    assert ours.loss.lagrange_multiplier[1] == pytest.approx(0.9)
-    assert not any(map(torch.equal, before, ours.loss.parameters()))
-    moments = [group.optimizer.state_dict()["state"] for group in (ours, plain)]
-    for mine, its in zip(moments[0].values(), moments[1].values(), strict=True):
-        assert torch.equal(mine["exp_avg_sq"], its["exp_avg_sq"])
 
 
 def test_discounts(make_arm):
@@ -351,8 +362,7 @@ def test_saved_and_loaded(make_arm, tmp_path):
     trainer = second.safe_trainer().load_from_file(file)
     assert trainer.collected_frames == 2 * FRAMES
     assert torch.equal(second.updater.integral, first.updater.integral)
-    for key, value in first.loss.state_dict().items():
-        assert torch.equal(torch.as_tensor(second.loss.state_dict()[key]), torch.as_tensor(value))
+    assert_same_state(second.loss, first.loss)
     # Only the multiplier is handed over here: integral and smoothed cost are missing then.
     fresh.loss.lagrange_multiplier.copy_(first.loss.lagrange_multiplier)
     for arm in (first, second, fresh):
