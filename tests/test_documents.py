@@ -10,17 +10,22 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 
-def run(path):
+def run(path, folder=None):
     done = subprocess.run(
-        [sys.executable, str(path)], capture_output=True, text=True, timeout=240, check=False
+        [sys.executable, str(path)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+        cwd=folder,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
 
-def code_of(document):
+def code_of(document, language="python"):
     text = (ROOT / document).read_text(encoding="utf-8")
-    return re.findall(r"```python\n(.*?)```", text, re.S)
+    return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
 def test_readme_loop(tmp_path):
@@ -66,6 +71,24 @@ def test_algorithms(tmp_path):
     script = tmp_path / "algorithms.py"
     script.write_text("\n".join(setting + loop for loop in loops), encoding="utf-8")
     assert run(script) == "tensor(True) 0\n"
+
+
+def test_trainers(tmp_path):
+    """The trainer, then the one that Hydra makes, on one small batch each."""
+    (config,) = code_of("docs/trainers.md", "yaml")
+    code = "\n".join(code_of("docs/trainers.md"))
+    for text, name in ((config, "config.yaml"), (code, "trainers.py")):
+        short = re.sub(r"(frames_per_batch|total_frames)(=|: )[0-9_]+", r"\g<1>\g<2>1280", text)
+        short = re.sub(r"num_epochs(=|: )10", r"num_epochs\g<1>1", short)
+        assert short.count("1280") == 2
+        (tmp_path / name).write_text(short, encoding="utf-8")
+    shown = re.findall(r"multiplier (\S+)", run(tmp_path / "trainers.py", tmp_path))
+    assert len(shown) == 2
+    (log,) = tmp_path.joinpath("runs").rglob("episode_cost/collision.csv")
+    step, cost = log.read_text().split(",")
+    assert int(step) == 1280
+    assert float(shown[0]) == pytest.approx(max(0, 0.2 * (float(cost) - 0.5)), abs=0.01)
+    assert (tmp_path / "runs" / "checkpoint").exists()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda p: p.stem)

@@ -1,4 +1,4 @@
-"""What may import what: losses without environments, environments without losses."""
+"""What may import what: losses without environments, environments without losses, and so on."""
 
 import ast
 import subprocess
@@ -29,6 +29,28 @@ def test_the_losses_need_no_simulator():
     loaded = load("torchrl_safe.objectives")
     assert "torchrl_safe.objectives.ppo_lagrangian" in loaded
     assert {name for name in loaded if not name.startswith("torchrl_safe.objectives")} == set()
+
+
+def test_the_trainers_need_the_losses_only():
+    """Neither environments nor simulator; Hydra for its configurations, which say so."""
+    code = (
+        "import sys; sys.modules['hydra'] = None\n"
+        "import torchrl_safe.trainers\n"
+        "print(*(n for n in sys.modules if n.startswith(('pybullet', 'torchrl_safe.'))))\n"
+        "import torchrl_safe.trainers.configs"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    loaded = set(done.stdout.split())
+    assert "torchrl_safe.trainers.multiplier_hook" in loaded
+    packages = ("torchrl_safe.objectives", "torchrl_safe.trainers")
+    assert {name for name in loaded if not name.startswith(packages)} == set()
+    assert done.returncode != 0
+    assert (
+        'ImportError: torchrl_safe.trainers.configs needs Hydra: pip install "torchrl-safe[hydra]"'
+        in done.stderr
+    )
 
 
 def test_the_metrics_need_neither_simulator_nor_environments_nor_losses():
@@ -65,8 +87,11 @@ def is_in(name, package):
     ("importer", "forbidden"),
     [
         pytest.param("envs", "torchrl_safe.objectives", id="envs-import-no-losses"),
+        pytest.param("envs", "torchrl_safe.trainers", id="envs-import-no-trainers"),
         pytest.param("objectives", "torchrl_safe.envs", id="losses-import-no-envs"),
+        pytest.param("objectives", "torchrl_safe.trainers", id="losses-import-no-trainers"),
         pytest.param("objectives", "pybullet", id="losses-import-no-pybullet"),
+        pytest.param("trainers", "torchrl_safe.envs", id="trainers-import-no-envs"),
     ],
 )
 def test_environments_and_losses_are_apart(importer, forbidden):

@@ -14,23 +14,23 @@ class CostUpdater(abc.ABC):
     """Checks episode costs, and lets :meth:`_move` write one buffer of a loss in place.
 
     Args:
-        loss_module (LossModule): a loss with the buffer named ``_buffer``, of shape ``(k,)``.
+        loss_module (LossModule): a loss with the buffer named ``buffer_name``, of shape ``(k,)``.
 
     Keyword Args:
         cost_limit (float or Tensor): limit of each expected episode cost, one number or k.
         pessimism (float, optional): standard errors of the mean that are added to it.
     """
 
-    _buffer: str
+    buffer_name: str
 
     def __init__(
         self, loss_module: LossModule, *, cost_limit: float | Tensor, pessimism: float = 0.0
     ) -> None:
         if not isinstance(loss_module, LossModule):
             raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
-        buffer = dict(loss_module.named_buffers(recurse=False)).get(self._buffer)
+        buffer = dict(loss_module.named_buffers(recurse=False)).get(self.buffer_name)
         if buffer is None:
-            raise ValueError(f"{type(loss_module).__name__} has no {self._buffer} buffer.")
+            raise ValueError(f"{type(loss_module).__name__} has no {self.buffer_name} buffer.")
         limit = torch.as_tensor(cost_limit, dtype=buffer.dtype)
         if limit.shape not in ((), buffer.shape):
             raise ValueError(
@@ -60,7 +60,7 @@ class CostUpdater(abc.ABC):
         With :class:`~torchrl.envs.RewardSum` a collector's batch gives it as
         ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``.
         """
-        buffer = getattr(self.loss_module, self._buffer)
+        buffer = getattr(self.loss_module, self.buffer_name)
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:
             raise ValueError(
                 f"episode_cost must have shape (E, {len(buffer)}), got {tuple(episode_cost.shape)}."

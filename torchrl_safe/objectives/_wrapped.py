@@ -7,7 +7,11 @@ from dataclasses import fields
 from typing import Any
 
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictParams
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictParams,
+)
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss
@@ -68,6 +72,11 @@ class WrappedLoss(LossModule):
     def actor_network(self) -> ProbabilisticTensorDictSequential:
         """The policy of the wrapped loss."""
         return self.loss_module.actor_network
+
+    @property
+    def critic_network(self) -> TensorDictModule:
+        """The critic of the wrapped loss."""
+        return self.loss_module.critic_network
 
     @property
     def critic_network_params(self) -> TensorDictParams:

@@ -56,7 +56,7 @@ class MultiplierUpdater(CostUpdater):
         tensor([2.5000])
     """
 
-    _buffer = "lagrange_multiplier"
+    buffer_name = "lagrange_multiplier"
 
     def __init__(
         self,

@@ -46,7 +46,7 @@ class ViolationUpdater(CostUpdater):
         tensor([ 2.0000, -4.5000])
     """
 
-    _buffer = "cost_violation"
+    buffer_name = "cost_violation"
 
     def _move(self, buffer: Tensor, violation: Tensor) -> None:
         buffer.copy_(violation)

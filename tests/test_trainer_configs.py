@@ -1,0 +1,138 @@
+"""Hydra configurations: they say what the constructors say, and they compose with TorchRL's."""
+
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from torchrl_safe.envs import IIWA, ArmEnv, Scattered
+from torchrl_safe.objectives import (
+    DualAscent,
+    LagrangianLoss,
+    PIDControl,
+    ViolationUpdater,
+)
+from torchrl_safe.trainers import PPOLagrangianTrainer
+from torchrl_safe.trainers.configs import (
+    ArmEnvConfig,
+    DualAscentConfig,
+    LagrangianLossConfig,
+    PIDControlConfig,
+    PPOLagrangianTrainerConfig,
+    ViolationUpdaterConfig,
+    register_configs,
+)
+
+DOCUMENT = Path(__file__).parent.parent / "docs" / "trainers.md"
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """The folder of the documented configuration."""
+    register_configs()
+    folder = tmp_path_factory.mktemp("configs")
+    (text,) = re.findall(r"```yaml\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.S)
+    (folder / "config.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def read(folder, *overrides):
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
+
+
+CONFIGS = {
+    ArmEnvConfig: ArmEnv,
+    LagrangianLossConfig: LagrangianLoss,
+    DualAscentConfig: DualAscent,
+    PIDControlConfig: PIDControl,
+    ViolationUpdaterConfig: ViolationUpdater,
+}
+
+
+@pytest.mark.parametrize(
+    ("config", "made"), CONFIGS.items(), ids=[made.__name__ for made in CONFIGS.values()]
+)
+def test_each_argument_with_its_default(config, made):
+    node = OmegaConf.structured(config)
+    fields = {name for name in node if not name.startswith("_")}
+    parameters = dict(inspect.signature(made.__init__).parameters)
+    del parameters["self"]
+    if made not in (ArmEnv, LagrangianLoss):
+        del parameters["loss_module"]  # It is given by the trainer.
+    assert fields == set(parameters)
+    for name, parameter in parameters.items():
+        if parameter.default is parameter.empty:
+            assert OmegaConf.is_missing(node, name)
+        else:
+            default = node[name]
+            configured = instantiate(default) if OmegaConf.is_dict(default) else default
+            assert same(configured, parameter.default), name
+
+
+def same(configured, default):
+    """Equal; functions of functools.partial and torch's transforms compare by what they are."""
+    if isinstance(default, torch.distributions.transforms.ComposeTransform):
+        return default.parts == configured.parts
+    return getattr(configured, "func", configured) == default
+
+
+def test_the_arguments_of_the_trainer():
+    fields = set(PPOLagrangianTrainerConfig.__dataclass_fields__)
+    ours = inspect.signature(PPOLagrangianTrainer).parameters
+    assert set(ours) - {"kwargs"} <= fields
+    node = OmegaConf.structured(PPOLagrangianTrainerConfig)
+    for name in ("frame_skip", "optim_steps_per_batch", "gamma", "lmbda", "add_gae", "gae"):
+        assert node[name] == ours[name].default
+    for name in ("done_key", "episode_cost_key", "cost_names"):
+        assert node[name] == ours[name].default
+    assert OmegaConf.is_missing(node, "updater")
+
+
+def test_the_documented_configuration(example):
+    """Everything in it is what it names, and the collector has the very policy of the loss."""
+    trainer = instantiate(read(example).trainer)
+    collector, loss = trainer.collector, trainer.loss_module
+    assert isinstance(trainer, PPOLagrangianTrainer)
+    assert collector.env.base_env.arm == IIWA
+    assert isinstance(loss, LagrangianLoss)
+    assert next(collector.policy.parameters()) is next(loss.actor_network.parameters())
+    assert loss.value_estimator.gamma == loss.cost_value_estimator.gamma == pytest.approx(0.97)
+    updater = trainer._modules["multiplier"].updater
+    assert isinstance(updater, DualAscent)
+    assert updater.loss_module is loss
+    trainer.shutdown()
+
+
+def test_another_rule_and_two_costs(example):
+    """Lists arrive as k numbers."""
+    loss = instantiate(read(example).loss, num_costs=2)
+    config = PIDControlConfig(cost_limit=[1.0, 2.0], kp=0.5, ki=0.1, kd=0.5)
+    updater = instantiate(config)(loss)
+    assert isinstance(updater, PIDControl)
+    assert updater.cost_limit.tolist() == [1, 2]
+    updater.step(torch.tensor([[3.0, 2.0]]))
+    assert loss.lagrange_multiplier.tolist() == pytest.approx([1.2, 0])
+
+
+def test_other_parts_of_an_arm():
+    node = OmegaConf.structured(
+        ArmEnvConfig(
+            num_envs=2,
+            obstacles={"_target_": "torchrl_safe.envs.Scattered", "count": 2},
+            costs={
+                "touch": {"_target_": "torchrl_safe.envs.Collision"},
+                "close": {"_target_": "torchrl_safe.envs.Proximity", "margin": 0.1},
+            },
+        )
+    )
+    env = instantiate(node)
+    assert env.batch_size == (2,)
+    assert env.obstacles == Scattered(count=2)
+    assert env.cost_names == ("touch", "close")
+    env.close()

@@ -1,0 +1,439 @@
+"""The multiplier inside TorchRL's trainers: the hook, the PPO trainer, and what they save."""
+
+import csv
+
+import pytest
+import torch
+from cmdp import ENVS, TwoActions, make_networks
+from networks import make_batch, make_loss
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torchrl.checkpoint import Checkpoint
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, SoftUpdate
+from torchrl.record import CSVLogger
+from torchrl.trainers.algorithms import PPOTrainer, SACTrainer
+
+from torchrl_safe.envs import ArmEnv, Collision
+from torchrl_safe.objectives import (
+    CRPOLoss,
+    CUPLoss,
+    DualAscent,
+    FOCOPSLoss,
+    IPOLoss,
+    LagrangianLoss,
+    P3OLoss,
+    PIDControl,
+    PPOLagrangianLoss,
+    SACLagrangianLoss,
+    TrustRegionLoss,
+    ViolationUpdater,
+)
+from torchrl_safe.trainers import MultiplierHook, PPOLagrangianTrainer
+
+WORLDS, STEPS, FRAMES = 4, 5, 40
+
+
+def always(state):
+    """Costs 1 in each step: 5 in an episode of ours, and nothing can be done about it."""
+    return torch.ones(len(state.goal)).numpy()
+
+
+class Arm:
+    """What a training on a real arm is made of, the same for the same seed."""
+
+    def __init__(self, seed=0, rule=DualAscent, **settings):
+        torch.manual_seed(seed)
+        self.costs = {"collision": Collision(), "always": always}
+        arm = ArmEnv(num_envs=WORLDS, costs=self.costs, max_episode_steps=STEPS, seed=seed)
+        env = TransformedEnv(arm, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
+        observations = env.observation_spec["observation"].shape[-1]
+        actor = make_actor(observations)
+        critic = ValueOperator(MLP(observations, 1, num_cells=[8]), ["observation"])
+        cost_critic = ValueOperator(
+            MLP(observations, 2, num_cells=[8]), ["observation"], ["cost_value"]
+        )
+        self.loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=2, entropy_bonus=False)
+        self.updater = rule(self.loss, **(settings or {"cost_limit": 2.0, "lr": 0.1}))
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=1e-3)
+        self.buffer = make_buffer(FRAMES, FRAMES // 2)
+        self.collector = make_collector(env, actor, FRAMES)
+
+    def trainer(self, kind=PPOLagrangianTrainer, batches=2, **settings):
+        """A trainer of these parts."""
+        return kind(
+            collector=self.collector,
+            total_frames=batches * FRAMES,
+            frame_skip=1,
+            optim_steps_per_batch=None,
+            loss_module=self.loss,
+            optimizer=self.optimizer,
+            replay_buffer=self.buffer,
+            progress_bar=False,
+            log_interval=0,
+            seed=1,
+            **settings,
+        )
+
+    def safe_trainer(self, **settings):
+        return self.trainer(updater=self.updater, cost_names=list(self.costs), **settings)
+
+
+def make_actor(observations):
+    policy = nn.Sequential(MLP(observations, 6, num_cells=[8]), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+
+
+def make_collector(env, actor, frames):
+    return Collector(env, actor, frames_per_batch=frames, auto_register_policy_transforms=False)
+
+
+def make_buffer(frames, minibatch):
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(frames), sampler=SamplerWithoutReplacement(), batch_size=minibatch
+    )
+
+
+@pytest.fixture
+def make_arm():
+    """Closes every collector that a test has made with it."""
+    made = []
+
+    def make(*args, **kwargs):
+        made.append(Arm(*args, **kwargs))
+        return made[-1]
+
+    yield make
+    for arm in made:
+        arm.collector.shutdown()
+
+
+def read_log(folder, name):
+    """Steps and values of a scalar that TorchRL's CSV logger has written."""
+    (file,) = folder.rglob(f"{name}.csv")
+    with file.open() as rows:
+        return [(int(step), float(value)) for step, value in csv.reader(rows)]
+
+
+# ---------------------------------------------------------------- the hook
+
+
+def make_episodes(cost, done, key="episode_cost"):
+    """A batch of what a hook reads: running sums of the costs, and where episodes end."""
+    next_data = TensorDict({key: torch.tensor(cost)}, batch_size=[len(done)])
+    next_data["done"] = torch.tensor(done).unsqueeze(-1)
+    return TensorDict({"next": next_data}, batch_size=[len(done)])
+
+
+def test_one_batch_by_hand():
+    """Of three rows two ended, at mean costs (4, 1): 0.5 times (4 - 1, 1 - 2), not below 0."""
+    loss = make_loss(num_costs=2, multiplier_init=0.25)
+    hook = MultiplierHook(DualAscent(loss, cost_limit=torch.tensor([1.0, 2.0]), lr=0.5))
+    batch = make_episodes([[3.0, 2.0], [9.0, 9.0], [5.0, 0.0]], [True, False, True])
+    assert hook(batch) is batch
+    assert loss.lagrange_multiplier.tolist() == [1.75, 0]
+    assert hook.log(batch) == {
+        "log_pbar": True,
+        "lagrange_multiplier/0": 1.75,
+        "lagrange_multiplier/1": 0,
+        "episode_cost/0": 4,
+        "episode_cost/1": 1,
+    }
+
+
+def test_a_batch_in_which_no_episode_ended():
+    loss = make_loss(multiplier_init=0.25)
+    hook = MultiplierHook(DualAscent(loss, cost_limit=1.0, lr=0.5), cost_names=["touch"])
+    batch = hook(make_episodes([[3.0], [4.0]], [False, False]))
+    assert loss.lagrange_multiplier.item() == 0.25
+    assert hook.log(batch) == {"log_pbar": True, "lagrange_multiplier/touch": 0.25}
+
+
+def test_violations():
+    loss = P3OLoss(*make_networks(1))
+    hook = MultiplierHook(ViolationUpdater(loss, cost_limit=1.0), cost_names=["touch"])
+    scalars = hook.log(hook(make_episodes([[3.0], [4.0]], [True, True])))
+    assert scalars["cost_violation/touch"] == 2.5
+
+
+def test_nested_keys():
+    loss = make_loss()
+    hook = MultiplierHook(
+        DualAscent(loss, cost_limit=1.0, lr=1.0),
+        episode_cost_key=("arm", "total"),
+        done_key=("arm", "done"),
+    )
+    done = torch.tensor([[[True], [False]], [[False], [True]]])
+    batch = TensorDict(batch_size=[2])
+    batch["next", "arm", "done"] = done
+    batch["next", "arm", "total"] = torch.tensor([[[2.0], [9.0]], [[9.0], [4.0]]])
+    hook(batch)
+    assert loss.lagrange_multiplier.item() == 2
+
+
+def test_padded_batches():
+    """Trajectories of different length: what fills them up has not ended."""
+    loss = make_loss()
+    hook = MultiplierHook(DualAscent(loss, cost_limit=0.0, lr=1.0))
+    batch = TensorDict(batch_size=[2, 3])
+    batch["collector", "mask"] = torch.tensor([[True, True, True], [True, False, False]])
+    batch["next", "done"] = torch.tensor([[False, False, True], [True, False, False]]).unsqueeze(-1)
+    batch["next", "episode_cost"] = torch.tensor([[1.0, 2.0, 3.0], [5.0, 0.0, 0.0]]).unsqueeze(-1)
+    hook(batch)
+    assert loss.lagrange_multiplier.item() == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cost_names": ["touch"]}, "cost_names must be a different name for each of the 2 costs"),
+        ({"cost_names": ["touch", "touch"]}, "cost_names must be a different name for each"),
+        ({"cost_names": "ab"}, "cost_names must be a different name for each .* got 'ab'"),
+    ],
+)
+def test_bad_names(settings, message):
+    updater = DualAscent(make_loss(num_costs=2), cost_limit=1.0, lr=0.5)
+    with pytest.raises(ValueError, match=message):
+        MultiplierHook(updater, **settings)
+
+
+def test_no_updater():
+    with pytest.raises(TypeError, match=r"updater must be a MultiplierUpdater .* got SGD"):
+        MultiplierHook(torch.optim.SGD([nn.Parameter(torch.ones(1))]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({}, KeyError, r"episode_cost_key .*'next.*'episode_cost.* is not .* append RewardSum"),
+        ({"done_key": "end"}, KeyError, "done_key .'next', 'end'. is not in the batch"),
+        (
+            {"episode_cost_key": "observation", "done_key": "cost"},
+            ValueError,
+            r"done_key .* must be of shape \(4, 6, 1\) .* got \(4, 6, 2\)",
+        ),
+        (
+            {"episode_cost_key": "observation"},
+            ValueError,
+            r"episode_cost must have shape \(E, 2\), got \(5, 4\)",
+        ),
+    ],
+)
+def test_a_batch_that_does_not_fit(settings, error, message):
+    loss = make_loss(num_costs=2)
+    hook = MultiplierHook(DualAscent(loss, cost_limit=1.0, lr=0.5), **settings)
+    with pytest.raises(error, match=message):
+        hook(make_batch(num_costs=2))
+    assert loss.lagrange_multiplier.tolist() == [0, 0]
+
+
+def test_an_updater_of_another_loss(make_arm):
+    arm = make_arm()
+    other = DualAscent(make_loss(num_costs=2), cost_limit=1.0, lr=0.5)
+    with pytest.raises(ValueError, match="updater must be of the trainer's loss_module"):
+        arm.trainer(updater=other)
+
+
+# ---------------------------------------------------------------- the trainers
+
+
+def test_the_hook_in_a_ppo_trainer(make_arm, tmp_path):
+    """Costs of 5 in each episode, a limit of 2, a rate of 0.1: 0.3 more with each batch."""
+    arm = make_arm()
+    logger = CSVLogger("run", log_dir=str(tmp_path))
+    trainer = arm.trainer(PPOTrainer, 3, gae=arm.loss.estimate_advantages, logger=logger)
+    MultiplierHook(arm.updater, cost_names=list(arm.costs)).register(trainer)
+    trainer.train()
+    multipliers = read_log(tmp_path, "lagrange_multiplier/always")
+    assert [step for step, _ in multipliers] == [40, 80, 120]
+    assert [value for _, value in multipliers] == pytest.approx([0.3, 0.6, 0.9])
+    assert read_log(tmp_path, "episode_cost/always") == [(40, 5), (80, 5), (120, 5)]
+    assert len(read_log(tmp_path, "lagrange_multiplier/collision")) == 3
+    # The loss has seen what the hook has written, and its cost critic learns.
+    assert read_log(tmp_path, "lagrange_multiplier_1") == multipliers
+    assert read_log(tmp_path, "loss_cost_critic")[0][1] > 0
+
+
+def test_the_hook_in_a_sac_trainer(tmp_path):
+    """Off policy it is the same hook: costs of 5 in each episode again, one cost this time."""
+    torch.manual_seed(0)
+    arm = ArmEnv(num_envs=WORLDS, costs={"always": always}, max_episode_steps=STEPS, seed=0)
+    env = TransformedEnv(arm, RewardSum(["reward", "cost"], ["reward_sum", "episode_cost"]))
+    observations = env.observation_spec["observation"].shape[-1]
+    actor = make_actor(observations)
+    inputs = {"in_keys": ["observation", "action"]}
+    loss = SACLagrangianLoss(
+        actor,
+        ValueOperator(MLP(observations + 3, 1, num_cells=[8]), **inputs),
+        ValueOperator(
+            MLP(observations + 3, 1, num_cells=[8]), out_keys=["state_action_cost_value"], **inputs
+        ),
+        target_entropy=-3.0,
+    )
+    logger = CSVLogger("run", log_dir=str(tmp_path))
+    collector = make_collector(env, actor, FRAMES)
+    trainer = SACTrainer(
+        collector=collector,
+        total_frames=2 * FRAMES,
+        frame_skip=1,
+        optim_steps_per_batch=2,
+        loss_module=loss,
+        optimizer=torch.optim.Adam(loss.parameters(), lr=1e-3),
+        target_net_updater=SoftUpdate(loss, eps=0.99),
+        replay_buffer=TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=20),
+        logger=logger,
+        log_interval=0,
+        progress_bar=False,
+    )
+    updater = DualAscent(loss, cost_limit=2.0, lr=0.1)
+    MultiplierHook(updater, cost_names=["always"]).register(trainer)
+    trainer.train()
+    values = [value for _, value in read_log(tmp_path, "lagrange_multiplier/always")]
+    assert values == pytest.approx([0.3, 0.6])
+
+
+def plain_loop(arm, batches):
+    """What PPOLagrangianTrainer does, written out."""
+    torch.manual_seed(arm.collector.set_seed(1, static_seed=False))
+    for _, batch in zip(range(batches), arm.collector, strict=False):
+        arm.updater.step(batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)])
+        for _ in range(4):
+            arm.buffer.extend(arm.loss.estimate_advantages(batch).reshape(-1))
+            for minibatch in arm.buffer:
+                losses = arm.loss(minibatch)
+                sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+                arm.optimizer.step()
+                arm.optimizer.zero_grad()
+
+
+def with_the_hook(arm, batches):
+    trainer = arm.trainer(PPOTrainer, batches, gae=arm.loss.estimate_advantages)
+    MultiplierHook(arm.updater).register(trainer)
+    return trainer
+
+
+@pytest.mark.parametrize("make", [Arm.safe_trainer, with_the_hook], ids=["trainer", "hook"])
+def test_a_trainer_is_the_plain_loop(make_arm, make):
+    """All parameters, the multipliers and Adam's state, bit for bit."""
+    ours, plain = make_arm(), make_arm()
+    before = [parameter.clone() for parameter in ours.loss.parameters()]
+    make(ours, batches=3).train()
+    plain_loop(plain, 3)
+    assert_same_state(ours.loss, plain.loss)
+    assert ours.loss.lagrange_multiplier[1] == pytest.approx(0.9)
+    assert not any(map(torch.equal, before, ours.loss.parameters()))
+    moments = [arm.optimizer.state_dict()["state"] for arm in (ours, plain)]
+    for mine, its in zip(moments[0].values(), moments[1].values(), strict=True):
+        assert torch.equal(mine["exp_avg_sq"], its["exp_avg_sq"])
+
+
+def assert_same_state(loss, expected):
+    state, expected = loss.state_dict(), expected.state_dict()
+    assert state.keys() == expected.keys()
+    for key, value in expected.items():
+        assert torch.equal(torch.as_tensor(state[key]), torch.as_tensor(value)), key
+
+
+def test_discounts(make_arm):
+    arm = make_arm()
+    arm.safe_trainer(gamma=0.9, lmbda=0.8)
+    for estimator in (arm.loss.value_estimator, arm.loss.cost_value_estimator):
+        assert estimator.gamma.item() == pytest.approx(0.9)
+        assert estimator.lmbda.item() == pytest.approx(0.8)
+
+
+PID = {"cost_limit": 2.0, "kp": 0.5, "ki": 0.1, "kd": 0.5}
+
+
+def test_saved_and_loaded(make_arm, tmp_path):
+    """The trainer that has loaded takes the same next step of the multiplier; a fresh one not."""
+    file = tmp_path / "checkpoint"
+    first, second, fresh = (make_arm(rule=PIDControl, **PID) for _ in range(3))
+    first.safe_trainer(checkpoint=Checkpoint(), save_trainer_file=file).train()
+    trainer = second.safe_trainer().load_from_file(file)
+    assert trainer.collected_frames == 2 * FRAMES
+    assert torch.equal(second.updater.integral, first.updater.integral)
+    assert_same_state(second.loss, first.loss)
+    # Only the multiplier is handed over here: integral and smoothed cost are missing then.
+    fresh.loss.lagrange_multiplier.copy_(first.loss.lagrange_multiplier)
+    for arm in (first, second, fresh):
+        arm.updater.step(torch.tensor([[1.0, 4.0]]))
+    assert torch.equal(second.loss.lagrange_multiplier, first.loss.lagrange_multiplier)
+    assert not torch.equal(fresh.loss.lagrange_multiplier, first.loss.lagrange_multiplier)
+
+
+@pytest.mark.filterwarnings("ignore:The (default|legacy).*heckpoint:Warning")
+def test_saved_and_loaded_as_one_file(make_arm, tmp_path):
+    """TorchRL's older format, which it still writes unless it is given a Checkpoint."""
+    file = tmp_path / "checkpoint.pt"
+    first, second = (make_arm(rule=PIDControl, **PID) for _ in range(2))
+    first.safe_trainer(save_trainer_file=str(file)).train()
+    second.safe_trainer().load_from_file(str(file))
+    assert torch.equal(second.updater.integral, first.updater.integral)
+    assert torch.equal(second.loss.lagrange_multiplier, first.loss.lagrange_multiplier)
+
+
+LOSSES = {
+    "ppo-lagrangian": (PPOLagrangianLoss, DualAscent),
+    "a2c-lagrangian": (lambda a, c, cc, **k: LagrangianLoss(A2CLoss(a, c), cc, **k), DualAscent),
+    "kl-ppo": (lambda a, c, cc, **k: LagrangianLoss(KLPENPPOLoss(a, c), cc, **k), DualAscent),
+    "focops": (FOCOPSLoss, DualAscent),
+    "p3o": (P3OLoss, ViolationUpdater),
+    "ipo": (IPOLoss, ViolationUpdater),
+    "crpo": (lambda a, c, cc, **k: CRPOLoss(ClipPPOLoss(a, c), cc, **k), ViolationUpdater),
+}
+
+
+@pytest.mark.parametrize(("make", "rule"), LOSSES.values(), ids=LOSSES.keys())
+def test_every_loss_that_one_optimizer_minimizes(make, rule):
+    """Two actions, each with a cost of its own: whatever is done, the mean costs sum to 1."""
+    torch.manual_seed(0)
+    actor, critic, cost_critic = make_networks()
+    loss = make(actor, critic, cost_critic, num_costs=2)
+    rate = {"lr": 1.0} if rule is DualAscent else {}
+    updater = rule(loss, cost_limit=0.0, **rate)
+    before = [parameter.clone() for parameter in loss.parameters()]
+    PPOLagrangianTrainer(
+        collector=make_collector(TwoActions(), actor, ENVS),
+        total_frames=ENVS,
+        loss_module=loss,
+        updater=updater,
+        optimizer=torch.optim.SGD(loss.parameters(), lr=0.1),
+        replay_buffer=make_buffer(ENVS, ENVS // 2),
+        progress_bar=False,
+        episode_cost_key="cost",  # Each episode is one step long.
+    ).train()
+    moved = getattr(loss, updater.buffer_name)
+    assert moved.sum() == pytest.approx(1)
+    assert moved.min() > 0.1
+    assert not any(map(torch.equal, before, loss.parameters()))
+
+
+@pytest.mark.parametrize("make", [CUPLoss, TrustRegionLoss])
+def test_losses_with_a_loop_of_their_own(make):
+    loss = make(*make_networks(1))
+    with pytest.raises(ValueError, match="loss_module must be minimized as it stands, got"):
+        PPOLagrangianTrainer(loss_module=loss, updater=None, collector=None, total_frames=1)
+
+
+def test_a_loss_without_costs():
+    loss = ClipPPOLoss(*make_networks(1)[:2])
+    with pytest.raises(TypeError, match=r"loss_module must be .* cost critic, .* got ClipPPOLoss"):
+        PPOLagrangianTrainer(loss_module=loss, updater=None, collector=None, total_frames=1)
+
+
+def test_a_trainer_that_sees_no_batches(make_arm):
+    with pytest.raises(ValueError, match="async_collection must be False"):
+        make_arm().safe_trainer(async_collection=True)
+    hook = MultiplierHook(DualAscent(make_loss(), cost_limit=1.0, lr=0.5))
+    with pytest.raises(ValueError, match="collector must yield its batches"):
+        hook.log(None)
