@@ -79,11 +79,13 @@ class MultiplierUpdater(CostUpdater):
 
     def _move(self, buffer: Tensor, violation: Tensor) -> None:
         proposal = self.next_multiplier(buffer, violation)
-        if proposal.shape != buffer.shape or not proposal.isfinite().all():
+        # A proposal of infinity is one beyond the bound, if there is one.
+        projected = proposal.clamp(0, self.max_multiplier)
+        if projected.shape != buffer.shape or not projected.isfinite().all():
             raise ValueError(
                 f"next_multiplier must return {len(buffer)} finite numbers, got {proposal}."
             )
-        buffer.copy_(proposal.clamp(0, self.max_multiplier))
+        buffer.copy_(projected)
 
     @torch.no_grad()
     def step(self, episode_cost: Tensor) -> None:
@@ -106,7 +108,9 @@ class MultiplierUpdater(CostUpdater):
         limit = self.cost_limit.to(episode_cost)
         mean = episode_cost.mean(0)
         deviation = episode_cost.std(0) if len(episode_cost) > 1 else mean
-        return torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
+        scale = torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
+        # An infinite scale would never be forgotten.
+        return scale.clamp_max(torch.finfo(scale.dtype).max)
 
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
