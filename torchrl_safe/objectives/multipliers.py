@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
+from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives._cost_updater import CostUpdater
 
 
@@ -68,8 +70,10 @@ class MultiplierUpdater(CostUpdater):
         normalize: bool = False,
     ) -> None:
         super().__init__(loss_module, cost_limit=cost_limit, pessimism=pessimism)
-        if max_multiplier is not None and not max_multiplier > 0:
-            raise ValueError(f"max_multiplier must be positive, got {max_multiplier}.")
+        if max_multiplier is not None and as_number(max_multiplier) != math.inf:
+            max_multiplier = check_number("max_multiplier", max_multiplier, positive=True)
+        if not isinstance(normalize, bool):
+            raise TypeError(f"normalize must be a bool, got {normalize!r}.")
         if normalize and (self.cost_limit < 0).any():
             raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
         self.max_multiplier = max_multiplier
@@ -202,8 +206,7 @@ class DualAscent(MultiplierUpdater):
             pessimism=pessimism,
             normalize=normalize,
         )
-        if not 0 < lr < float("inf"):
-            raise ValueError(f"lr must be positive and finite, got {lr}.")
+        check_number("lr", lr, positive=True)
         multiplier = loss_module.lagrange_multiplier
         if not parametrization.inv(multiplier).isfinite().all():
             raise ValueError(
