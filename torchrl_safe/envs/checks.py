@@ -30,7 +30,7 @@ def check_count(**values: int) -> None:
     """Raises ValueError unless each value is a whole number of at least 1."""
     for name, value in values.items():
         try:
-            usable = not isinstance(value, bool) and operator.index(value) >= 1
+            usable = not isinstance(value, bool) and 1 <= operator.index(value) < 2**31
         except TypeError:
             usable = False
         if not usable:

@@ -174,7 +174,13 @@ class CostCriticMixin(LossModule):
         """
         if self.separate_losses:
             tensordict = tensordict.detach()
-        target = get_or_raise(tensordict, self.tensor_keys.cost_value_target)
+        key = self.tensor_keys.cost_value_target
+        target = get_or_raise(tensordict, key)
+        if target.shape[-1] != self.num_costs:
+            raise ValueError(
+                f"{key!r} must have one column for each of the {self.num_costs} costs of "
+                f"num_costs, got shape {tuple(target.shape)}."
+            )
         old_value = None
         if self.clip_value:
             old_value = get_or_raise(tensordict, self.tensor_keys.cost_value)
