@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict.nn import (
@@ -32,6 +33,24 @@ class Affine(torch.nn.Module):
         return self.loc + self.scale * x
 
 
+@dataclass(frozen=True)
+class ActorSpec:
+    """The shape of a policy: with its weights, all that is needed to make it again.
+
+    Args:
+        observations: width of the observation.
+        actions: width of the action.
+        noise: whether the policy's deviation is the same in every state, chosen in each state, or
+            there is none: it then gives the action itself.
+        bounded: whether actions are between -1 and 1.
+    """
+
+    observations: int
+    actions: int
+    noise: Literal["same", "chosen", "none"]
+    bounded: bool
+
+
 class Agent(NamedTuple):
     """A policy, critics of the state, and the logarithm of the policy's deviation in all states."""
 
@@ -39,6 +58,7 @@ class Agent(NamedTuple):
     critic: ValueOperator
     cost_critic: ValueOperator
     log_std: torch.nn.Parameter
+    spec: ActorSpec
 
 
 class QAgent(NamedTuple):
@@ -47,6 +67,37 @@ class QAgent(NamedTuple):
     actor: TensorDictModuleBase
     critic: ValueOperator
     cost_critic: ValueOperator
+    spec: ActorSpec
+
+
+def make_actor(
+    spec: ActorSpec, loc: Tensor | None = None, scale: Tensor | None = None
+) -> TensorDictModuleBase:
+    """Makes a policy.
+
+    Args:
+        spec: its shape.
+        loc: what is added to observations, shape ``(observations,)``; by default nothing.
+        scale: what they are multiplied by before that, the same; by default 1.
+    """
+    loc = torch.zeros(spec.observations) if loc is None else loc
+    scale = torch.ones(spec.observations) if scale is None else scale
+    outputs = spec.actions * (2 if spec.noise == "chosen" else 1)
+    net = torch.nn.Sequential(Affine(loc, scale), _small_network(spec.observations, outputs))
+    if spec.noise == "none":
+        policy = torch.nn.Sequential(net, torch.nn.Tanh())
+        return TensorDictModule(policy, ["observation"], ["action"])
+    if spec.noise == "chosen":
+        policy = torch.nn.Sequential(net, NormalParamExtractor())
+    else:
+        policy = torch.nn.Sequential(net, AddStateIndependentNormalScale(spec.actions))
+    return ProbabilisticActor(
+        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal if spec.bounded else IndependentNormal,
+        distribution_kwargs={"tanh_loc": False} if spec.bounded else {},
+        return_log_prob=spec.noise == "same",
+    )
 
 
 def make_agent(env: EnvBase, *, gamma: float) -> Agent:
@@ -62,27 +113,19 @@ def make_agent(env: EnvBase, *, gamma: float) -> Agent:
         gamma: discount of reward and costs.
     """
     loc, scale = _standardization(env)
-    actions, costs = env.action_spec.shape[-1], env.reward_spec["cost"].shape[-1]
-
-    def network(outputs: int) -> torch.nn.Sequential:
-        return torch.nn.Sequential(Affine(loc, scale), _small_network(len(loc), outputs))
+    spec = _actor_spec(env, noise="same")
 
     def critic(outputs: int, out_key: str) -> ValueOperator:
-        predict = torch.nn.Sequential(network(outputs), Affine(0.0, 1 / (1 - gamma)))
+        net = _small_network(spec.observations, outputs)
+        predict = torch.nn.Sequential(
+            torch.nn.Sequential(Affine(loc, scale), net), Affine(0.0, 1 / (1 - gamma))
+        )
         return ValueOperator(predict, in_keys=["observation"], out_keys=[out_key])
 
-    noise = AddStateIndependentNormalScale(actions)
-    policy = torch.nn.Sequential(network(actions), noise)
-    bounded = not isinstance(env.action_spec, Unbounded)
-    actor = ProbabilisticActor(
-        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal if bounded else IndependentNormal,
-        distribution_kwargs={"tanh_loc": False} if bounded else {},
-        return_log_prob=True,
-    )
-    critics = critic(1, "state_value"), critic(costs, "cost_value")
-    return Agent(actor, *critics, noise.state_independent_scale)
+    actor = make_actor(spec, loc, scale)
+    log_std = actor.get_parameter("0.module.1.state_independent_scale")
+    critics = critic(1, "state_value"), critic(_num_costs(env), "cost_value")
+    return Agent(actor, *critics, log_std, spec)
 
 
 def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
@@ -95,28 +138,17 @@ def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
             state, or gives the action itself.
     """
     loc, scale = _standardization(env)
-    actions, costs = env.action_spec.shape[-1], env.reward_spec["cost"].shape[-1]
-    outputs = 2 * actions if stochastic else actions
-    net = torch.nn.Sequential(Affine(loc, scale), _small_network(len(loc), outputs))
-    if stochastic:
-        policy = torch.nn.Sequential(net, NormalParamExtractor())
-        actor = ProbabilisticActor(
-            TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            distribution_kwargs={"tanh_loc": False},
-        )
-    else:
-        policy = torch.nn.Sequential(net, torch.nn.Tanh())
-        actor = TensorDictModule(policy, ["observation"], ["action"])
+    spec = _actor_spec(env, noise="chosen" if stochastic else "none")
+    actor = make_actor(spec, loc, scale)
 
     def critic(outputs: int, out_key: str) -> ValueOperator:
-        net = _small_network(len(loc) + actions, outputs)
+        net = _small_network(spec.observations + spec.actions, outputs)
         predict = _OfStateAndAction(Affine(loc, scale), net, Affine(0.0, 1 / (1 - gamma)))
         return ValueOperator(predict, in_keys=["observation", "action"], out_keys=[out_key])
 
+    costs = _num_costs(env)
     critics = critic(1, "state_action_value"), critic(costs, "state_action_cost_value")
-    return QAgent(actor, *critics)
+    return QAgent(actor, *critics, spec)
 
 
 class _OfStateAndAction(torch.nn.Module):
@@ -126,6 +158,19 @@ class _OfStateAndAction(torch.nn.Module):
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         return self.unit(self.net(self.standardize(observation), action))
+
+
+def _actor_spec(env: EnvBase, *, noise: Literal["same", "chosen", "none"]) -> ActorSpec:
+    return ActorSpec(
+        observations=env.observation_spec["observation"].shape[-1],
+        actions=env.action_spec.shape[-1],
+        noise=noise,
+        bounded=not isinstance(env.action_spec, Unbounded),
+    )
+
+
+def _num_costs(env: EnvBase) -> int:
+    return env.reward_spec["cost"].shape[-1]
 
 
 def _standardization(env: EnvBase) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from torchrl.envs import CatTensors, EnvBase, Transform
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, LossModule, ValueEstimators
 
-from experiments.agent import make_agent, make_q_agent
+from experiments.agent import ActorSpec, make_agent, make_q_agent
 from experiments.learners import Learner, NoiseSchedule, OnPolicyLearner, ReplayLearner
 from torchrl_safe.envs import EarlyTermination, Saute
 from torchrl_safe.objectives import (
@@ -58,6 +58,7 @@ class Training:
 
     Args:
         actor: the policy.
+        actor_spec: its shape.
         collector: the policy that collects, which may add noise of its own.
         loss: the loss.
         updater: what tells the loss of the batch's episode costs.
@@ -65,6 +66,7 @@ class Training:
     """
 
     actor: TensorDictModuleBase
+    actor_spec: ActorSpec
     collector: TensorDictModuleBase
     loss: LossModule
     updater: Updater | None
@@ -145,7 +147,8 @@ class OnPolicy:
             phases=phases,
             actor_step=step,
         )
-        return Training(agent.actor, agent.actor, loss, self.updater(loss, config), learner)
+        updater = self.updater(loss, config)
+        return Training(agent.actor, agent.spec, agent.actor, loss, updater, learner)
 
 
 @dataclass(frozen=True)
@@ -189,7 +192,8 @@ class OffPolicy:
             minibatch=config.minibatch,
             steps_per_update=8,
         )
-        return Training(agent.actor, collector, loss, self.updater(loss, config), learner)
+        updater = self.updater(loss, config)
+        return Training(agent.actor, agent.spec, collector, loss, updater, learner)
 
 
 Algorithm = OnPolicy | OffPolicy

@@ -19,6 +19,7 @@ def evaluate(
     policy: Callable[[TensorDictBase], TensorDictBase],
     episodes: int,
     seed: int,
+    max_steps: int | None = None,
 ) -> TensorDict:
     """Runs the deterministic policy.
 
@@ -26,23 +27,36 @@ def evaluate(
     episodes to end, as TorchRL's ``Evaluator`` does, would favour short ones.)
 
     Args:
-        env: batched environment with ``episode_reward`` and ``episode_cost``.
+        env: environment, batched or not, with ``episode_reward`` and ``episode_cost``.
         policy: the policy.
         episodes: how many episodes at least.
         seed: seed of the episodes, so that every policy meets the same ones.
+        max_steps: steps in which every episode ends. Defaults to the environment's
+            ``max_episode_steps``.
 
     Returns:
-        One row for each episode, with ``success``, ``episode_reward``, ``episode_cost`` and
-        ``steps``.
+        One row for each episode, with ``episode_reward``, ``episode_cost``, ``steps``, and
+        ``success`` if the environment tells.
+
+    Raises:
+        ValueError: if an episode has not ended after ``max_steps``.
     """
+    max_steps = env.max_episode_steps if max_steps is None else max_steps
     rounds = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(math.ceil(episodes / env.num_envs)):
+        for _ in range(math.ceil(episodes / env.batch_size.numel())):
             seed = env.set_seed(seed)
-            play = env.rollout(env.max_episode_steps, policy, break_when_any_done=False)
-            last = play["next", "done"].squeeze(-1).int().argmax(1)
-            end = play["next"][torch.arange(env.num_envs), last]
-            end = end.select("success", "episode_reward", "episode_cost")
+            play = env.rollout(max_steps, policy, break_when_any_done=False)
+            play = play.reshape(-1, play.shape[-1])["next"]
+            done = play["done"].squeeze(-1)
+            if not done.any(1).all():
+                raise ValueError(
+                    f"max_steps must let every episode end, got {max_steps}, after which "
+                    f"{int((~done.any(1)).sum())} of {len(done)} go on."
+                )
+            last = done.int().argmax(1)
+            end = play[torch.arange(len(done)), last]
+            end = end.select("success", "episode_reward", "episode_cost", strict=False)
             rounds.append(end.set("steps", last.unsqueeze(-1) + 1))
     return torch.cat(rounds)
 
@@ -57,11 +71,10 @@ def summarize(episodes: TensorDict, cost_names: tuple[str, ...]) -> dict[str, li
         cost_names: names of the columns of ``episode_cost``.
     """
     costs = episodes["episode_cost"]
-    estimates = {
-        "success": share(episodes["success"]),
-        "return": mean(episodes["episode_reward"]),
-        "steps": mean(episodes["steps"]),
-    }
+    success = episodes.get("success", None)
+    estimates = {} if success is None else {"success": share(success)}
+    estimates["return"] = mean(episodes["episode_reward"])
+    estimates["steps"] = mean(episodes["steps"])
     for name, column in zip(cost_names, costs.split(1, -1), strict=True):
         estimates[f"cost/{name}"] = mean(column)
         estimates[f"any/{name}"] = violation_rate(column, 0.0)

@@ -179,6 +179,10 @@ def _descend(
 ) -> None:
     losses = loss(minibatch)
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    # One step with NaN and all that was learnt is lost: rather none, and an error.
+    moved = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    gradients = [parameter.grad for parameter in moved if parameter.grad is not None]
+    torch.nn.utils.get_total_norm(gradients, error_if_nonfinite=True)
     torch.nn.utils.clip_grad_norm_(policy, 0.5)
     optimizer.step()
     optimizer.zero_grad()

@@ -19,6 +19,11 @@ COLOURS = ("tab:orange", "tab:blue", "tab:green", "tab:purple")
 def table(results: dict[str, Any]) -> str:
     """Returns a Markdown table: a row for each algorithm, estimates with 95 % intervals."""
     rows = {name: run["evaluation"] for name, run in results["algorithms"].items()}
+    return figures_table(rows, results["config"]["cost_limit"])
+
+
+def figures_table(rows: dict[str, dict[str, list[float]]], cost_limit: float) -> str:
+    """Returns a Markdown table of named rows of figures, each with its interval or without."""
     columns = list(next(iter(rows.values())))
     lines = [
         "| evaluation | " + " | ".join(_heading(column) for column in columns) + " |",
@@ -27,7 +32,7 @@ def table(results: dict[str, Any]) -> str:
     for name, row in rows.items():
         cells = (_cell(*row[column], share=_is_share(column)) for column in columns)
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    lines.append(f"\nCost limit {results['config']['cost_limit']:g}; brackets: 95 % confidence.")
+    lines.append(f"\nCost limit {cost_limit:g}; brackets: 95 % confidence.")
     return "\n".join(lines)
 
 
@@ -81,15 +86,20 @@ def save_animation(
 
 
 def _is_share(column: str) -> bool:
-    return column == "success" or column.startswith("any/")
+    return column == "success" or column.startswith(("any/", "above/"))
 
 
 def _heading(column: str) -> str:
     kind, _, name = column.partition("/")
-    return {"cost": f"episode cost: {name}", "any": f"episodes with {name}"}.get(kind, kind)
+    headings = {
+        "cost": f"episode cost: {name}",
+        "any": f"episodes with {name}",
+        "above": f"episodes above the limit of {name}",
+        "worst": f"cost of the worst tenth: {name}",
+    }
+    return headings.get(kind, kind)
 
 
-def _cell(estimate: float, low: float, high: float, *, share: bool) -> str:
-    if share:
-        return f"{estimate:.1%} [{low:.1%}, {high:.1%}]"
-    return f"{estimate:.2f} [{low:.2f}, {high:.2f}]"
+def _cell(estimate: float, *interval: float, share: bool) -> str:
+    shown = [f"{value:.1%}" if share else f"{value:.2f}" for value in (estimate, *interval)]
+    return f"{shown[0]} [{shown[1]}, {shown[2]}]" if interval else shown[0]

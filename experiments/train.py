@@ -31,6 +31,7 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, OffPolicy
 from experiments.evaluation import evaluate, summarize
+from experiments.policy import save_policy
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.envs import (
     PAPER_CARTESIAN,
@@ -184,6 +185,7 @@ def make_env(
     algorithm: AlgorithmName = "ppo",
     *,
     training: bool = False,
+    gui: bool = False,
 ) -> EnvBase:
     """Makes the environment that an algorithm trains in, with sums of reward and cost.
 
@@ -194,6 +196,7 @@ def make_env(
         "observation": OBSERVATIONS[config.observation],
         "num_envs": num_envs,
         "seed": seed,
+        "gui": gui,
     }
     if config.paper:
         env = paper_env(PAPER_ACTIONS[config.action], **settings)
@@ -272,6 +275,8 @@ def train(
     if training.updater is not None:
         state["updater"] = training.updater
     Checkpoint(**state).save(config.out / algorithm / "checkpoint")
+    trained = {**json.loads(json.dumps(dataclasses.asdict(config), default=str)), "name": algorithm}
+    save_policy(config.out / algorithm / "policy.pt", training.actor, training.actor_spec, trained)
     return training.actor, history
 
 

@@ -499,9 +499,11 @@ def test_multiplier_init_must_be_finite_and_not_negative(kind, init):
 @each_loss
 def test_there_is_at_least_one_of_each(kind):
     actor, critic, cost_critic = make_actor(kind), make_critic(), make_cost_critic()
-    with pytest.raises(ValueError, match="num_costs must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="num_costs must be a whole number of at least 1, got 0"):
         kind(actor, critic, cost_critic, num_costs=0, **OWN[kind])
-    with pytest.raises(ValueError, match="num_cost_qvalue_nets must be at least 1, got 0"):
+    with pytest.raises(
+        ValueError, match="num_cost_qvalue_nets must be a whole number of at least 1, got 0"
+    ):
         kind(actor, critic, cost_critic, num_cost_qvalue_nets=0, **OWN[kind])
     message = "one network or num_cost_qvalue_nets = 2 of them, got 3"
     with pytest.raises(ValueError, match=message):

@@ -346,7 +346,7 @@ def test_a_loss_that_would_normalize_the_mixture_is_refused(parent, argument):
 
 def test_costs_that_do_not_fit_are_refused():
     actor, critic, cost_critic = make_networks(3)
-    with pytest.raises(ValueError, match="num_costs must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="num_costs must be a whole number of at least 1, got 0"):
         LagrangianLoss(A2CLoss(actor, critic), cost_critic, num_costs=0)
     with pytest.raises(ValueError, match=r"multiplier_init.* 2 costs.*\(3,\)"):
         wrap(A2CLoss, 2, multiplier_init=torch.ones(3))

@@ -471,7 +471,7 @@ def test_multiplier_init_must_have_one_number_for_each_cost(shape):
 
 @pytest.mark.parametrize("num_costs", [0, -1])
 def test_there_is_at_least_one_cost(num_costs):
-    with pytest.raises(ValueError, match=f"num_costs must be at least 1, got {num_costs}"):
+    with pytest.raises(ValueError, match=f"num_costs must be a whole number .* got {num_costs}"):
         PPOLagrangianLoss(*make_networks(), num_costs=num_costs)
 
 

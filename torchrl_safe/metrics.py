@@ -9,6 +9,7 @@ one number for each cost. Needs SciPy: ``pip install "torchrl-safe[metrics]"``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -283,7 +284,7 @@ def conditional_value_at_risk(episode_cost: Tensor, alpha: float) -> Tensor:
         >>> conditional_value_at_risk(cost, 0.375)  # (5 + 0.5 * 2) / 1.5
         tensor([4.], dtype=torch.float64)
     """
-    if not 0 < alpha <= 1:
+    if not isinstance(alpha, Real) or not 0 < alpha <= 1:
         raise ValueError(f"alpha must be above 0 and at most 1, got {alpha}.")
     cost = _by_seed("episode_cost", episode_cost).flatten(0, 1).sort(0, descending=True).values
     weight = (alpha * len(cost) - torch.arange(len(cost), dtype=cost.dtype)).clamp(0, 1)
@@ -387,7 +388,10 @@ def _by_seed(name: str, values: Tensor) -> Tensor:
 def _limit(cost_limit: float | Tensor, cost: Tensor) -> Tensor:
     # Rounded as the costs are: a float32 cost of 0.1 is not above a limit of 0.1.
     dtype = cost.dtype if cost.is_floating_point() else torch.float64
-    limit = torch.as_tensor(cost_limit, dtype=dtype).double().cpu()
+    try:
+        limit = torch.as_tensor(cost_limit, dtype=dtype).double().cpu()
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(f"cost_limit must be numbers, got {cost_limit!r}.") from error
     if limit.shape not in ((), cost.shape[-1:]):
         raise ValueError(
             f"cost_limit must be one number or one for each of the {cost.shape[-1]} costs, got "
@@ -399,7 +403,7 @@ def _limit(cost_limit: float | Tensor, cost: Tensor) -> Tensor:
 
 
 def _check_confidence(confidence: float) -> None:
-    if not 0 < confidence < 1:
+    if not isinstance(confidence, Real) or not 0 < confidence < 1:
         raise ValueError(f"confidence must be between 0 and 1, got {confidence}.")
 
 
@@ -418,7 +422,9 @@ def _bootstrap(
     cost = _by_seed("episode_cost", episode_cost).numpy()
     _check_confidence(confidence)
     counts = {"seeds": cost.shape[0], "episodes": cost.shape[1]}
-    if resample not in counts:
+    if not isinstance(seed, Integral) or seed < 0:
+        raise ValueError(f"seed must be a whole number and not negative, got {seed!r}.")
+    if not isinstance(resample, str) or resample not in counts:
         raise ValueError(f'resample must be "episodes" or "seeds", got {resample!r}.')
     if counts[resample] < 2:
         raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -79,6 +80,10 @@ class CartesianDelta:
     def __post_init__(self) -> None:
         check_positive(step=self.step)
         _check_bound(self.bound)
+        if not callable(self.inverse_kinematics):
+            raise TypeError(
+                f"inverse_kinematics must be callable, got {self.inverse_kinematics!r}."
+            )
         if self.orientation is not None:
             length = np.linalg.norm(check_array("orientation", self.orientation, (4,)))
             if not np.isclose(length, 1, atol=1e-3):
@@ -190,5 +195,5 @@ def _finger_targets(action: Array, state: ArmState, step: float | None) -> Array
 
 
 def _check_bound(bound: float) -> None:
-    if not bound > 0:
-        raise ValueError(f"bound must be positive, got {bound}.")
+    if not isinstance(bound, Real) or not bound > 0:
+        raise ValueError(f"bound must be positive, got {bound!r}.")

@@ -347,6 +347,8 @@ class ArmEnv(EnvBase):
         shape = self.action_spec.shape
         if action.shape != shape:
             raise ValueError(f"action must have shape {tuple(shape)}, got {tuple(action.shape)}.")
+        if action.is_complex():
+            raise ValueError(f"action must be real, got {action.dtype}.")
         array = action.detach().cpu().numpy().astype(float)
         if not np.isfinite(array).all():
             rows = np.flatnonzero(~np.isfinite(array).all(axis=1)).tolist()

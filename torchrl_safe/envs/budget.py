@@ -37,7 +37,10 @@ class CostTally(Transform, abc.ABC):
         reward_key: NestedKey,
         out_key: NestedKey,
     ) -> None:
-        limit = torch.as_tensor(budget, dtype=torch.get_default_dtype())
+        try:
+            limit = torch.as_tensor(budget, dtype=torch.get_default_dtype())
+        except (OverflowError, RuntimeError, TypeError, ValueError) as error:
+            raise ValueError(f"budget must be numbers, got {budget!r}.") from error
         if limit.ndim > 1 or not limit.isfinite().all() or (limit < 0).any():
             raise ValueError(
                 "budget must be one number or one for each cost, finite and not negative, got "

@@ -16,14 +16,21 @@ def check_positive(**values: float) -> None:
     """Raises ValueError unless each value is a number, positive and finite."""
     for name, value in values.items():
         if not isinstance(value, Real) or not 0 < value < np.inf:
-            raise ValueError(f"{name} must be positive and finite, got {value}.")
+            raise ValueError(f"{name} must be positive and finite, got {value!r}.")
+
+
+def check_not_negative(**values: float) -> None:
+    """Raises ValueError unless each value is a number, not negative and finite."""
+    for name, value in values.items():
+        if not isinstance(value, Real) or not 0 <= value < np.inf:
+            raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
 
 
 def check_count(**values: int) -> None:
     """Raises ValueError unless each value is a whole number of at least 1."""
     for name, value in values.items():
         try:
-            usable = not isinstance(value, bool) and operator.index(value) >= 1
+            usable = not isinstance(value, bool) and 1 <= operator.index(value) < 2**31
         except TypeError:
             usable = False
         if not usable:
@@ -41,8 +48,11 @@ def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
 def check_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     """Returns the values as an array; raises ValueError unless they have a shape and are finite."""
     try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
+        array = np.asarray(values)
+        if array.dtype.kind not in "biuf":  # Not of text or objects, which NumPy converts too.
+            raise TypeError(f"no numbers: {array.dtype}")
+        array = array.astype(float)
+    except (OverflowError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{name} must be numbers of shape {shape}, got {values!r}.") from error
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}.")

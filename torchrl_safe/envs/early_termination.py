@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite
 
 from torchrl_safe.envs.budget import CostTally
+from torchrl_safe.envs.checks import check_array
 
 
 class EarlyTermination(CostTally):
@@ -77,8 +76,7 @@ class EarlyTermination(CostTally):
         super().__init__(
             budget, start=0.0, cost_key=cost_key, reward_key=reward_key, out_key=out_key
         )
-        if not math.isfinite(termination_reward):
-            raise ValueError(f"termination_reward must be finite, got {termination_reward}.")
+        check_array("termination_reward", termination_reward, ())
         self.termination_reward = termination_reward
         self.terminated_key, self.done_key = unravel_key(terminated_key), unravel_key(done_key)
 

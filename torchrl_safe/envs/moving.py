@@ -139,6 +139,14 @@ class Moving:
     def __post_init__(self) -> None:
         check_kind("layout", self.layout, Obstacles)
         check_kind("motion", self.motion, Motion)
+        # Layouts and tasks have a method of that name too.
+        try:
+            displacement = self.motion.sample(np.random.default_rng(0), np.array([0.0, 1.0, 0.0]))
+            check_array("displacement", displacement(np.zeros(1)), (1, 3))
+        except (AttributeError, TypeError, ValueError) as error:
+            raise TypeError(
+                f"motion must map times to displacements, got {self.motion!r}."
+            ) from error
         if any(shape.mass for shape in self.layout.shapes):
             raise ValueError(
                 f"layout must have shapes of mass 0, which follow their way, got {self.layout}."

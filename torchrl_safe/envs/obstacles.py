@@ -9,7 +9,13 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs.checks import check_array, check_count, check_kind, check_positive
+from torchrl_safe.envs.checks import (
+    check_array,
+    check_count,
+    check_kind,
+    check_not_negative,
+    check_positive,
+)
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector
 from torchrl_safe.envs.shapes import Cylinder, Shape, footprint
@@ -48,9 +54,13 @@ class Placement:
     path: Path | None = None
 
     def __post_init__(self) -> None:
-        count = len(self.position)
+        count = len(self.position) if np.iterable(self.position) else 0
         upright = np.tile(UPRIGHT, (count, 1))
-        present = np.ones(count, bool) if self.present is None else np.asarray(self.present, bool)
+        present = np.ones(count, bool) if self.present is None else np.asarray(self.present)
+        if present.dtype != bool:
+            raise ValueError(f"present must be bool, got {self.present!r}.")
+        if not (self.path is None or callable(self.path)):
+            raise TypeError(f"path must be callable, got {self.path!r}.")
         if present.shape != (count,):
             raise ValueError(f"present must have shape {(count,)}, got {present.shape}.")
         filled = {
@@ -224,13 +234,7 @@ class Scattered:
         check_count(count=self.count)
         check_kind("region", self.region, Region)
         check_kind("shape", self.shape, Shape)
-        check_array("clearance", self.clearance, ())
-        check_array("spacing", self.spacing, ())
-        if self.clearance < 0 or self.spacing < 0:
-            raise ValueError(
-                f"clearance and spacing must not be negative, got {self.clearance} and "
-                f"{self.spacing}."
-            )
+        check_not_negative(clearance=self.clearance, spacing=self.spacing)
         if self.fewest is not None and self.fewest not in range(self.count + 1):
             raise ValueError(
                 f"fewest must be a whole number between 0 and count = {self.count}, got "

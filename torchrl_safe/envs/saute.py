@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
+from numbers import Real
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torchrl_safe.envs.budget import CostTally
+from torchrl_safe.envs.checks import check_array
 
 # In units of the budget: a budget that is used up to the last digit is not exceeded by rounding.
 _ROUNDING = 1e-5
@@ -91,11 +92,11 @@ class Saute(CostTally):
         )
         if not (self.budget > 0).all():
             raise ValueError(f"budget must be above 0, got {budget}.")
-        if not 0 < discount <= 1:
-            raise ValueError(f"discount must be above 0 and at most 1, got {discount}.")
-        if not math.isfinite(unsafe_reward):
-            raise ValueError(f"unsafe_reward must be finite, got {unsafe_reward}.")
-        self.unsafe_reward, self.discount = unsafe_reward, discount
+        if not isinstance(discount, Real) or not 0 < discount <= 1:
+            raise ValueError(f"discount must be above 0 and at most 1, got {discount!r}.")
+        check_array("unsafe_reward", unsafe_reward, ())
+        self.unsafe_reward: float = unsafe_reward
+        self.discount: float = discount
 
     def advance(self, tally: Tensor, cost: Tensor) -> Tensor:
         return (tally - cost / self.budget.to(cost)) / self.discount

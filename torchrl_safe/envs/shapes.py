@@ -6,12 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_array, check_positive
-
-
-def _check_mass(mass: float) -> None:
-    if not 0 <= mass < np.inf:
-        raise ValueError(f"mass must be finite and not negative, got {mass}.")
+from torchrl_safe.envs.checks import check_array, check_not_negative, check_positive
 
 
 @dataclass(frozen=True)
@@ -37,7 +32,7 @@ class Cylinder:
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius, height=self.height)
-        _check_mass(self.mass)
+        check_not_negative(mass=self.mass)
 
     @property
     def half_extents(self) -> tuple[float, float, float]:
@@ -67,7 +62,7 @@ class Box:
     def __post_init__(self) -> None:
         if not (check_array("half_extents", self.half_extents, (3,)) > 0).all():
             raise ValueError(f"half_extents must be positive, got {self.half_extents}.")
-        _check_mass(self.mass)
+        check_not_negative(mass=self.mass)
 
 
 @dataclass(frozen=True)
@@ -91,7 +86,7 @@ class Sphere:
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius)
-        _check_mass(self.mass)
+        check_not_negative(mass=self.mass)
 
     @property
     def half_extents(self) -> tuple[float, float, float]:
@@ -122,7 +117,7 @@ class Capsule:
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius, length=self.length)
-        _check_mass(self.mass)
+        check_not_negative(mass=self.mass)
 
     @property
     def half_extents(self) -> tuple[float, float, float]:

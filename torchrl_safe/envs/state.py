@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import NoReturn, Protocol, runtime_checkable
 
 import numpy as np
@@ -59,8 +60,8 @@ class Sensing:
     links: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.clearance < np.inf:
-            raise ValueError(f"clearance must be finite and not negative, got {self.clearance}.")
+        if not isinstance(self.clearance, Real) or not 0 <= self.clearance < np.inf:
+            raise ValueError(f"clearance must be finite and not negative, got {self.clearance!r}.")
 
     def __or__(self, other: Sensing) -> Sensing:
         return Sensing(

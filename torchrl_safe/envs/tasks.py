@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -68,8 +69,8 @@ class Reach:
 
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
-        if not self.order >= 1:
-            raise ValueError(f"order must be at least 1, got {self.order}.")
+        if not isinstance(self.order, Real) or not self.order >= 1:
+            raise ValueError(f"order must be at least 1, got {self.order!r}.")
 
     @property
     def objects(self) -> tuple[Shape, ...]:
@@ -124,7 +125,8 @@ class Push:
     sparse: bool = False
 
     def __post_init__(self) -> None:
-        _check(self.region, self.radius, self.shape)
+        _check(self.region, self.radius)
+        _check_object(self.shape)
         check_positive(distance=self.distance)
 
     @property
@@ -179,10 +181,11 @@ class PickAndPlace:
     sparse: bool = False
 
     def __post_init__(self) -> None:
-        _check(self.region, self.radius, self.shape)
+        _check(self.region, self.radius)
+        _check_object(self.shape)
         check_positive(distance=self.distance)
-        if not 0 <= self.on_table <= 1:
-            raise ValueError(f"on_table must be between 0 and 1, got {self.on_table}.")
+        if not isinstance(self.on_table, Real) or not 0 <= self.on_table <= 1:
+            raise ValueError(f"on_table must be between 0 and 1, got {self.on_table!r}.")
 
     @property
     def objects(self) -> tuple[Shape, ...]:
@@ -207,14 +210,16 @@ class PickAndPlace:
         return _object_distance(state) < self.radius
 
 
-def _check(region: Region | None, radius: float, shape: Shape | None = None) -> None:
+def _check(region: Region | None, radius: float) -> None:
     if region is not None:
         check_kind("region", region, Region)
     check_positive(radius=radius)
-    if shape is not None:
-        check_kind("shape", shape, Shape)
-        if not shape.mass:
-            raise ValueError(f"shape must have a mass to be moved, got {shape}.")
+
+
+def _check_object(shape: Shape) -> None:
+    check_kind("shape", shape, Shape)
+    if not shape.mass:
+        raise ValueError(f"shape must have a mass to be moved, got {shape}.")
 
 
 def _reward(distance: Array, radius: float, sparse: bool) -> Array:

@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _clip_value_loss, _get_default_device, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe.objectives._checks import check_count, check_number
 from torchrl_safe.objectives.cost_gae import CostGAE
 
 Self = TypeVar("Self", bound="CostCriticMixin")
@@ -57,8 +58,8 @@ class CostCriticMixin(LossModule):
         device: torch.device | None = None,
         **kwargs: Any,
     ) -> None:
-        if num_costs < 1:
-            raise ValueError(f"num_costs must be at least 1, got {num_costs}.")
+        check_count("num_costs", num_costs)
+        cost_critic_coeff = check_number("cost_critic_coeff", cost_critic_coeff)
         # The parent's constructor already asks for in_keys, before a module can be assigned.
         self._cost_critic_in_keys = list(cost_critic_network.in_keys)
         self._cost_value_estimator: ValueEstimatorBase | None = None
@@ -173,7 +174,13 @@ class CostCriticMixin(LossModule):
         """
         if self.separate_losses:
             tensordict = tensordict.detach()
-        target = get_or_raise(tensordict, self.tensor_keys.cost_value_target)
+        key = self.tensor_keys.cost_value_target
+        target = get_or_raise(tensordict, key)
+        if target.shape[-1] != self.num_costs:
+            raise ValueError(
+                f"{key!r} must have one column for each of the {self.num_costs} costs of "
+                f"num_costs, got shape {tuple(target.shape)}."
+            )
         old_value = None
         if self.clip_value:
             old_value = get_or_raise(tensordict, self.tensor_keys.cost_value)

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe.objectives._checks import check_count
 from torchrl_safe.objectives._cost_critic import build_value_estimators, get_or_raise
 from torchrl_safe.objectives._lagrange import initial_multiplier
 from torchrl_safe.objectives.cost_td0 import CostTD0
@@ -56,14 +57,10 @@ class CostCriticsMixin(LossModule):
         multiplier_init: float | Tensor = 0.0,
         **kwargs: Any,
     ) -> None:
-        if num_costs < 1:
-            raise ValueError(f"num_costs must be at least 1, got {num_costs}.")
+        check_count("num_costs", num_costs)
+        check_count("num_cost_qvalue_nets", num_cost_qvalue_nets)
         multiplier = initial_multiplier(num_costs, multiplier_init)
         networks = _as_list(cost_qvalue_network)
-        if num_cost_qvalue_nets < 1:
-            raise ValueError(
-                f"num_cost_qvalue_nets must be at least 1, got {num_cost_qvalue_nets}."
-            )
         if networks is not None and len(networks) != num_cost_qvalue_nets:
             raise ValueError(
                 f"cost_qvalue_network must be one network or num_cost_qvalue_nets = "

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_safe.objectives._checks import as_tensor, check_number
+
 
 class CostUpdater(abc.ABC):
     """Checks episode costs, and lets :meth:`_move` write one buffer of a loss in place.
@@ -31,7 +33,7 @@ class CostUpdater(abc.ABC):
         buffer = dict(loss_module.named_buffers(recurse=False)).get(self.buffer_name)
         if buffer is None:
             raise ValueError(f"{type(loss_module).__name__} has no {self.buffer_name} buffer.")
-        limit = torch.as_tensor(cost_limit, dtype=buffer.dtype)
+        limit = as_tensor("cost_limit", cost_limit, buffer.dtype)
         if limit.shape not in ((), buffer.shape):
             raise ValueError(
                 f"cost_limit must be one number or one for each of the {len(buffer)} costs, "
@@ -39,8 +41,7 @@ class CostUpdater(abc.ABC):
             )
         if not limit.isfinite().all():
             raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
-        if not 0 <= pessimism < float("inf"):
-            raise ValueError(f"pessimism must be finite and not negative, got {pessimism}.")
+        check_number("pessimism", pessimism)
         self.loss_module = loss_module
         self.cost_limit = limit.expand_as(buffer).clone()
         self.pessimism = pessimism

@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_safe.objectives._checks import as_tensor
 from torchrl_safe.objectives._cost_critic import CostCriticMixin
 from torchrl_safe.objectives.functional import penalized_advantage
 
@@ -60,7 +61,7 @@ class MixedAdvantageMixin(LagrangeMultiplierMixin):
 
 
 def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:
-    multiplier = torch.as_tensor(multiplier_init, dtype=torch.get_default_dtype())
+    multiplier = as_tensor("multiplier_init", multiplier_init, torch.get_default_dtype())
     if multiplier.shape not in ((), (num_costs,)):
         raise ValueError(
             f"multiplier_init must be one number or one for each of the {num_costs} costs, got "

@@ -82,9 +82,3 @@ class CostSurrogateMixin(ViolationMixin):
 
     def _cost_out_keys(self) -> list[NestedKey]:
         return ["loss_penalty", *super()._cost_out_keys()]
-
-
-def check_positive(name: str, value: float) -> None:
-    """Refuses a coefficient that is not positive, by name."""
-    if not value > 0:
-        raise ValueError(f"{name} must be positive, got {value}.")

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_safe.objectives._checks import check_number
 from torchrl_safe.objectives._cost_critic import CostKeys
 from torchrl_safe.objectives._wrapped import WrappedLoss
 from torchrl_safe.objectives.violation import ViolationMixin
@@ -171,8 +172,7 @@ class CRPOLoss(ViolationMixin, WrappedLoss):
             cost_critic_coeff=cost_critic_coeff,
             separate_losses=separate_losses,
         )
-        if not tolerance >= 0:
-            raise ValueError(f"tolerance must not be negative, got {tolerance}.")
+        tolerance = check_number("tolerance", tolerance)
         self.register_coeff_buffer("tolerance", tolerance, device=self.cost_critic_coeff.device)
 
     def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:

@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.distributions import kl_divergence
 from torchrl.objectives import PPOLoss
 
+from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives._cost_critic import CostKeys
 from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
-from torchrl_safe.objectives._surrogate import check_positive
 from torchrl_safe.objectives.functional import penalized_advantage
 
 
@@ -144,11 +144,12 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
-        check_positive("temperature", temperature)
-        check_positive("kl_bound", kl_bound)
+        temperature = check_number("temperature", temperature, positive=True)
+        if not as_number(kl_bound) > 0:
+            raise ValueError(f"kl_bound must be positive, got {kl_bound!r}.")
         device = self.cost_critic_coeff.device
         self.register_coeff_buffer("temperature", temperature, device=device)
-        self.register_coeff_buffer("kl_bound", kl_bound, device=device)
+        self.register_coeff_buffer("kl_bound", float(kl_bound), device=device)
         self._kl: Any = None
 
     def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:

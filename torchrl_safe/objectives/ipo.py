@@ -10,8 +10,9 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
+from torchrl_safe.objectives._checks import check_number
 from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._surrogate import CostSurrogateMixin, check_positive
+from torchrl_safe.objectives._surrogate import CostSurrogateMixin
 
 
 def log_barrier(violation: Tensor, sharpness: Tensor) -> Tensor:
@@ -163,7 +164,7 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
-        check_positive("sharpness", sharpness)
+        sharpness = check_number("sharpness", sharpness, positive=True)
         self.register_coeff_buffer("sharpness", sharpness, device=self.cost_critic_coeff.device)
 
     def _penalty(self, surrogate: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
+from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives._cost_updater import CostUpdater
 
 
@@ -68,8 +70,10 @@ class MultiplierUpdater(CostUpdater):
         normalize: bool = False,
     ) -> None:
         super().__init__(loss_module, cost_limit=cost_limit, pessimism=pessimism)
-        if max_multiplier is not None and not max_multiplier > 0:
-            raise ValueError(f"max_multiplier must be positive, got {max_multiplier}.")
+        if max_multiplier is not None and as_number(max_multiplier) != math.inf:
+            max_multiplier = check_number("max_multiplier", max_multiplier, positive=True)
+        if not isinstance(normalize, bool):
+            raise TypeError(f"normalize must be a bool, got {normalize!r}.")
         if normalize and (self.cost_limit < 0).any():
             raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
         self.max_multiplier = max_multiplier
@@ -79,11 +83,13 @@ class MultiplierUpdater(CostUpdater):
 
     def _move(self, buffer: Tensor, violation: Tensor) -> None:
         proposal = self.next_multiplier(buffer, violation)
-        if proposal.shape != buffer.shape or not proposal.isfinite().all():
+        # A proposal of infinity is one beyond the bound, if there is one.
+        projected = proposal.clamp(0, self.max_multiplier)
+        if projected.shape != buffer.shape or not projected.isfinite().all():
             raise ValueError(
                 f"next_multiplier must return {len(buffer)} finite numbers, got {proposal}."
             )
-        buffer.copy_(proposal.clamp(0, self.max_multiplier))
+        buffer.copy_(projected)
 
     @torch.no_grad()
     def step(self, episode_cost: Tensor) -> None:
@@ -106,7 +112,9 @@ class MultiplierUpdater(CostUpdater):
         limit = self.cost_limit.to(episode_cost)
         mean = episode_cost.mean(0)
         deviation = episode_cost.std(0) if len(episode_cost) > 1 else mean
-        return torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
+        scale = torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
+        # An infinite scale would never be forgotten.
+        return scale.clamp_max(torch.finfo(scale.dtype).max)
 
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
@@ -198,8 +206,7 @@ class DualAscent(MultiplierUpdater):
             pessimism=pessimism,
             normalize=normalize,
         )
-        if not 0 < lr < float("inf"):
-            raise ValueError(f"lr must be positive and finite, got {lr}.")
+        check_number("lr", lr, positive=True)
         multiplier = loss_module.lagrange_multiplier
         if not parametrization.inv(multiplier).isfinite().all():
             raise ValueError(

@@ -9,8 +9,9 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
+from torchrl_safe.objectives._checks import check_number
 from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._surrogate import CostSurrogateMixin, check_positive
+from torchrl_safe.objectives._surrogate import CostSurrogateMixin
 
 
 def exact_penalty(
@@ -150,7 +151,7 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
-        check_positive("penalty_coeff", penalty_coeff)
+        penalty_coeff = check_number("penalty_coeff", penalty_coeff, positive=True)
         device = self.cost_critic_coeff.device
         self.register_coeff_buffer("penalty_coeff", penalty_coeff, device=device)
 

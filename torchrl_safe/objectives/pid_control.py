@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives.multipliers import MultiplierUpdater
 
 
@@ -96,10 +97,9 @@ class PIDControl(MultiplierUpdater):
             normalize=normalize,
         )
         for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)):
-            if not 0 <= gain < float("inf"):
-                raise ValueError(f"{name} must be finite and not negative, got {gain}.")
-        if not 0 <= smoothing < 1:
-            raise ValueError(f"smoothing must be at least 0 and less than 1, got {smoothing}.")
+            check_number(name, gain)
+        if not 0 <= as_number(smoothing) < 1:
+            raise ValueError(f"smoothing must be at least 0 and less than 1, got {smoothing!r}.")
         self.kp, self.ki, self.kd, self.smoothing = kp, ki, kd, smoothing
         multiplier = loss_module.lagrange_multiplier
         self.integral = multiplier.clone()

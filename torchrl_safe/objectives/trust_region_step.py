@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -18,6 +16,7 @@ from torchrl_safe.objectives._actor import (
     read_flat,
     write_flat,
 )
+from torchrl_safe.objectives._checks import as_number, check_count, check_number
 from torchrl_safe.objectives._cost_critic import get_or_raise
 from torchrl_safe.objectives.trust_region import (
     NotPositiveDefiniteError,
@@ -125,20 +124,17 @@ class TrustRegionStep:
         max_backtracks: int = 10,
     ) -> None:
         _check_loss(loss_module, method)
+        for name, value in (("max_kl", max_kl), ("episode_length", episode_length)):
+            if value is not None:
+                check_number(name, value, positive=True)
+        check_number("damping", damping)
+        check_count("cg_iterations", cg_iterations)
         for name, value, allowed in (
-            (
-                "episode_length",
-                episode_length,
-                episode_length is None or 0 < episode_length < math.inf,
-            ),
-            ("max_kl", max_kl, 0 < max_kl < math.inf),
-            ("damping", damping, 0 <= damping < math.inf),
-            ("cg_iterations", cg_iterations, cg_iterations >= 1),
-            ("shrink", shrink, 0 < shrink < 1),
-            ("max_backtracks", max_backtracks, max_backtracks >= 0),
+            ("shrink", shrink, 0 < as_number(shrink) < 1),
+            ("max_backtracks", max_backtracks, as_number(max_backtracks) >= 0),
         ):
             if not allowed:
-                raise ValueError(f"{name} is out of its range, got {value}.")
+                raise ValueError(f"{name} is out of its range, got {value!r}.")
         self.loss_module = loss_module
         self.method = method
         self.episode_length = episode_length

@@ -1,0 +1,187 @@
+"""Plays with a policy that was saved: how good it is, how safe, and what it looks like.
+
+``python -m experiments.evaluate --policy runs/x/ppo-lagrangian/policy.pt`` plays in the environment
+of its training; ``--env my_module:make_env`` in one of your own.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+import tyro
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from experiments import train
+from experiments.evaluation import evaluate, summarize
+from experiments.policy import SavedPolicy, load_policy
+from experiments.report import figures_table, save_animation
+from torchrl_safe.envs import ArmEnv
+from torchrl_safe.metrics import conditional_value_at_risk, violation_rate
+
+# What of a training run's configuration its environment is made of.
+_ENVIRONMENT = ("arm", "obstacles", "action", "observation", "paper", "cost_limit")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Evaluate a policy that was saved on its own."""
+
+    policy: Path
+    """File that training has written: runs/.../policy.pt."""
+    env: str | None = None
+    """An environment of your own, as module:function. Called as function(num_envs=...), it
+    returns an ArmEnv, or any environment with reward and cost. Without it, the environment of the
+    training."""
+    episodes: int = 256
+    """Episodes to play at least, with the deterministic policy."""
+    envs: int = 32
+    """Worlds to play in side by side."""
+    max_steps: int | None = None
+    """Steps in which every episode ends; by default those of the arm's time limit."""
+    seed: int = 1_000_000
+    """Seed of the episodes."""
+    cost_limit: float | None = None
+    """Limit of the cost of an episode; by default that of the training."""
+    gui: bool = False
+    """Show some episodes in PyBullet's window, in real time. Needs a screen."""
+    video: Path | None = None
+    """Film some episodes of an arm into this file, .gif or .webp, at half speed."""
+    shown: int = 4
+    """Episodes to show or film."""
+    out: Path | None = None
+    """Folder for table.md and results.json; by default the table is only printed."""
+
+    def __post_init__(self) -> None:
+        for name in ("episodes", "envs", "shown"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.cost_limit is not None and not 0 <= self.cost_limit < math.inf:
+            raise ValueError(f"cost_limit must not be negative, got {self.cost_limit}.")
+        if self.video is not None and self.video.suffix not in (".gif", ".webp"):
+            raise ValueError(f"video must end in .gif or .webp, got {str(self.video)!r}.")
+        if self.gui and self.env is not None:
+            raise ValueError(f"gui must not be given with env, got {self.env!r}: open it there.")
+
+
+def factory(config: Config, saved: SavedPolicy) -> Callable[..., EnvBase]:
+    """Returns what makes the environment, called with ``num_envs``."""
+    if config.env is None:
+        known = {name: saved.settings[name] for name in _ENVIRONMENT}
+        algorithm = saved.settings["name"]
+        return partial(
+            train.make_env, train.Config(**known, algorithms=(algorithm,)), algorithm=algorithm
+        )
+    module, _, function = config.env.partition(":")
+    if not function:
+        raise ValueError(f"env must be module:function, got {config.env!r}.")
+    sys.path.insert(0, str(Path.cwd()))
+    return partial(_with_sums, getattr(importlib.import_module(module), function))
+
+
+def _with_sums(make_env: Callable[..., EnvBase], num_envs: int) -> EnvBase:
+    env = make_env(num_envs=num_envs)
+    if "episode_cost" in list(env.observation_spec.keys()):
+        return env
+    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
+    return env.append_transform(sums)
+
+
+def check_fit(env: EnvBase, saved: SavedPolicy, config: Config) -> None:
+    """Raises ValueError unless the environment is one that can be played as it is asked for."""
+    widths = {
+        "observations": env.observation_spec["observation"].shape[-1],
+        "actions": env.action_spec.shape[-1],
+    }
+    for name, width in widths.items():
+        if width != getattr(saved.spec, name):
+            raise ValueError(
+                f"env must have {name} of width {getattr(saved.spec, name)}, which the policy was "
+                f"trained for, got {width}."
+            )
+    if not is_arm(env):
+        if config.max_steps is None:
+            raise ValueError(f"max_steps must be given, {env} being no ArmEnv, got None.")
+        if config.video is not None:
+            raise ValueError(f"video films an ArmEnv, got {str(config.video)!r} with {env}.")
+
+
+def is_arm(env: EnvBase) -> bool:
+    """Tells whether it is an arm that the environment moves."""
+    return isinstance(env.base_env if isinstance(env, TransformedEnv) else env, ArmEnv)
+
+
+def play(env: EnvBase, saved: SavedPolicy, config: Config, limit: float) -> dict[str, list[float]]:
+    """Plays the episodes; returns their figures, each with its interval where it has one."""
+    episodes = evaluate(env, saved.actor, config.episodes, config.seed, config.max_steps)
+    costs = episodes["episode_cost"].shape[-1]
+    names = env.cost_names if is_arm(env) else tuple(map(str, range(costs)))
+    return {**summarize(episodes, names), **safety(episodes, names, limit)}
+
+
+def safety(episodes: TensorDict, names: tuple[str, ...], limit: float) -> dict[str, list[float]]:
+    """What the means do not tell: episodes above the limit, and the worst tenth of them."""
+    figures = {}
+    for name, column in zip(names, episodes["episode_cost"].split(1, -1), strict=True):
+        figures[f"above/{name}"] = torch.cat(violation_rate(column, limit)).tolist()
+        figures[f"worst/{name}"] = conditional_value_at_risk(column, 0.1).tolist()
+    return figures
+
+
+def watch(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], episodes: int) -> None:
+    """Plays in real time."""
+    begin, steps = time.perf_counter(), 0
+
+    def wait(env: EnvBase, tensordict: TensorDictBase) -> None:
+        nonlocal steps
+        steps += 1
+        time.sleep(max(0.0, begin + steps / env.control_rate - time.perf_counter()))
+
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(episodes):
+            env.rollout(env.max_episode_steps, policy, callback=wait)
+
+
+def main(config: Config) -> None:
+    """Evaluates, prints the table, and shows or films what was asked for."""
+    torch.set_num_threads(1)
+    saved = load_policy(config.policy)
+    make_env = factory(config, saved)
+    limit = saved.settings["cost_limit"] if config.cost_limit is None else config.cost_limit
+    env = make_env(num_envs=config.envs)
+    try:
+        check_fit(env, saved, config)
+        figures = play(env, saved, config, limit)
+    finally:
+        env.close()
+    text = figures_table({config.policy.parent.name: figures}, limit)
+    print(text)
+    if config.out is not None:
+        config.out.mkdir(parents=True, exist_ok=True)
+        (config.out / "table.md").write_text(text)
+        results = {"policy": str(config.policy), "cost_limit": limit, "evaluation": figures}
+        (config.out / "results.json").write_text(json.dumps(results, indent=1))
+    if config.video is not None:
+        stage = make_env(num_envs=1)
+        stage.set_seed(config.seed)
+        save_animation(stage, saved.actor, config.video, config.shown)
+        stage.close()
+    if config.gui:
+        stage = make_env(num_envs=1, gui=True)
+        stage.set_seed(config.seed)
+        watch(stage, saved.actor, config.shown)
+        stage.close()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,52 @@
+"""Checks of what comes in; each error names the argument and the value."""
+
+from __future__ import annotations
+
+import math
+import operator
+from numbers import Real
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raises ValueError unless the value is a whole number of at least 1."""
+    try:
+        usable = not isinstance(value, bool) and operator.index(value) >= 1
+    except TypeError:
+        usable = False
+    if not usable:
+        raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
+
+
+def check_number(name: str, value: Any, *, positive: bool = False) -> float:
+    """Returns the value; raises ValueError unless it is finite, not negative or even positive.
+
+    A float, whatever came: a buffer made of a whole number would hold whole numbers for ever.
+    """
+    number = as_number(value)
+    # Finite in single precision, in which losses compute.
+    if not (number > 0 if positive else number >= 0) or number > torch.finfo(torch.float32).max:
+        kind = "positive" if positive else "not negative"
+        raise ValueError(f"{name} must be finite and {kind}, got {value!r}.")
+    return number
+
+
+def as_number(value: Any) -> float:
+    """The value of a number or of a tensor with one element, NaN of anything else."""
+    if isinstance(value, Tensor):
+        return float(value) if value.numel() == 1 and not value.is_complex() else math.nan
+    try:
+        return float(value) if isinstance(value, Real) else math.nan
+    except OverflowError:
+        return math.nan
+
+
+def as_tensor(name: str, values: Any, dtype: torch.dtype) -> Tensor:
+    """Returns one or more numbers as a tensor; raises ValueError if they are none."""
+    try:
+        return torch.as_tensor(values, dtype=dtype)
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers, got {values!r}.") from error
