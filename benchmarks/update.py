@@ -1,0 +1,149 @@
+"""One optimizer step of PPO-Lagrangian against TorchRL's PPO, hand-written code and SB3's PPO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import ClipPPOLoss, LossModule
+
+from benchmarks.handwritten import HandWritten, arguments
+from benchmarks.networks import ACTION, OBSERVATION, make_actor, make_critic, make_minibatch
+from benchmarks.report import Figure
+from benchmarks.timing import Contender, Times, quartiles, race, ratio, timed
+from torchrl_safe.objectives import PPOLagrangianLoss
+
+_OPTIONS: dict[str, Any] = {"entropy_bonus": False, "loss_critic_type": "l2"}
+# Stable-Baselines3's default, which the others share.
+_MAX_GRAD_NORM = 0.5
+_LEARNING_RATE = 3e-4
+
+
+class Bystander(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Spaces for Stable-Baselines3, and nothing that takes time."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (OBSERVATION,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (ACTION,), np.float32)
+
+    def reset(self, **kwargs: object) -> tuple[np.ndarray, dict[str, object]]:
+        return self.observation_space.sample(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, object]]:
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+def summed(loss: LossModule) -> Callable[[TensorDictBase], Tensor]:
+    """The sum of a loss's terms, as every training loop takes it."""
+
+    def objective(minibatch: TensorDictBase) -> Tensor:
+        losses = loss(minibatch)
+        return sum(value for key, value in losses.items() if key.startswith("loss_"))
+
+    return objective
+
+
+def update(module: nn.Module, objective: Callable[[], Tensor]) -> Callable[[], None]:
+    """Forward, backward, clipped gradient and a fused Adam step."""
+    parameters = list(module.parameters())
+    optimizer = torch.optim.Adam(parameters, lr=_LEARNING_RATE, fused=True)
+
+    def step() -> None:
+        objective().backward()
+        nn.utils.clip_grad_norm_(parameters, _MAX_GRAD_NORM)
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return step
+
+
+def updates(minibatch: TensorDictBase, *, compiled: bool) -> Iterator[tuple[str, Callable]]:
+    """The three updates by name."""
+    for name, module in (
+        ("hand-written", HandWritten()),
+        ("ClipPPOLoss", ClipPPOLoss(make_actor(), make_critic("state_value"), **_OPTIONS)),
+        (
+            "PPOLagrangianLoss",
+            PPOLagrangianLoss(
+                make_actor(), make_critic("state_value"), make_critic("cost_value"), **_OPTIONS
+            ),
+        ),
+    ):
+        by_hand = isinstance(module, HandWritten)
+        objective: Callable[..., Tensor] = module if by_hand else summed(module)
+        inputs = arguments(minibatch) if by_hand else (minibatch,)
+        if compiled:
+            objective = torch.compile(objective, fullgraph=True)
+        yield name, update(module, partial(objective, *inputs))
+
+
+def stable_baselines(size: int, steps: int) -> dict[str, Contender]:
+    """One step of Stable-Baselines3's own ``train``, and its cutting out of the minibatch."""
+    envs = min(size, 64)
+    model = PPO(
+        "MlpPolicy",
+        DummyVecEnv([Bystander] * envs),
+        n_steps=size // envs,
+        batch_size=size,
+        n_epochs=steps,
+        learning_rate=_LEARNING_RATE,
+        max_grad_norm=_MAX_GRAD_NORM,
+        normalize_advantage=False,
+        device="cpu",
+    )
+    model.learn(size)
+
+    def train() -> float:
+        return timed(model.train)() / steps
+
+    return {
+        "SB3": train,
+        "SB3 sampling": timed(lambda: list(model.rollout_buffer.get(size)), calls=steps),
+    }
+
+
+def run(*, quick: bool) -> list[Figure]:
+    """Measures all of it."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    figures: list[Figure] = []
+    for size in (64,) if quick else (64, 256, 4096):
+        steps, rounds = (2, 2) if quick else (max(2, 2048 // size), 25)
+        minibatch = make_minibatch(size)
+        contenders = dict(stable_baselines(size, steps))
+        for compiled in (False,) if quick else (False, True):
+            for name, step in updates(minibatch, compiled=compiled):
+                kind = "compiled" if compiled else "eager"
+                contenders[f"{name}, {kind}"] = timed(step, calls=steps)
+        figures += summary(size, race(contenders, rounds=rounds))
+    return figures
+
+
+def summary(size: int, times: Times) -> Iterator[Figure]:
+    """The ratios that matter, and the milliseconds of each contender."""
+    others = times["SB3"] - times["SB3 sampling"]
+    for kind in ("eager", "compiled"):
+        ours = times.get(f"PPOLagrangianLoss, {kind}")
+        if ours is None:
+            continue
+        bars: dict[str, float | None] = {"hand-written": None, "ClipPPOLoss": None, "SB3": None}
+        if size == 64:
+            key = {"eager": "ClipPPOLoss", "compiled": "hand-written"}[kind]
+            bars |= {key: {"eager": 1.5, "compiled": 1.3}[kind]}
+            bars |= {"SB3": 1.0} if kind == "compiled" else {}
+        for name, bar in bars.items():
+            theirs = others if name == "SB3" else times[f"{name}, {kind}"]
+            yield ratio(
+                f"minibatch {size}, {kind}: PPOLagrangianLoss / {name}", ours, theirs, at_most=bar
+            )
+    yield from (
+        quartiles(f"minibatch {size}: {name}", 1e3 * seconds, "ms")
+        for name, seconds in times.items()
+    )
