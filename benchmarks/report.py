@@ -15,6 +15,8 @@ from typing import Any
 
 _PACKAGES = (
     "torch", "torchrl", "tensordict", "pybullet", "numpy", "panda-gym", "stable-baselines3", "ray",
+    # Without it, tensordict looks for it on the disk whenever a module writes a key.
+    "pandas",
 )  # fmt: skip
 
 

@@ -43,14 +43,14 @@ def race(contenders: Mapping[str, Contender], *, rounds: int) -> Times:
     """
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for index in range(rounds + 1):
-        for name, contender in contenders.items():
-            # Garbage is collected between the turns and in none of them.
-            gc.collect()
-            gc.disable()
-            try:
-                elapsed = contender()
-            finally:
-                gc.enable()
+        # Garbage is collected between the rounds and in none of them.
+        gc.collect()
+        gc.disable()
+        try:
+            turns = {name: contender() for name, contender in contenders.items()}
+        finally:
+            gc.enable()
+        for name, elapsed in turns.items():
             if index:
                 seconds[name].append(elapsed)
     return {name: np.array(values) for name, values in seconds.items()}
