@@ -31,7 +31,7 @@ def make_env(worlds: int, **settings: Any) -> ArmEnv:
 
 @contextmanager
 def collecting(collector: BaseCollector) -> Iterator[Contender]:
-    """A collector's time for a batch, on the wall: its workers' time is not that of this process."""
+    """A collector's time for a batch, on the wall, since its workers are other processes."""
     batches = iter(collector)
     try:
         yield timed(lambda: next(batches), clock=perf_counter)

@@ -16,7 +16,7 @@ from torchrl import torchrl_logger
 from benchmarks.report import Figure
 from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.algorithms import ALGORITHMS
-from experiments.train import Config, collecting, make_env
+from experiments.train import AlgorithmName, Config, collecting, make_env
 from torchrl_safe.envs import PAPER_JOINT, JointDelta, paper_env
 from torchrl_safe.envs.gym import ArmGymEnv
 
@@ -46,7 +46,7 @@ class PaperGymEnv(ArmGymEnv):
 @contextmanager
 def ours(config: Config) -> Iterator[Contender]:
     """PPO-Lagrangian as ``make train`` trains it in one process; a turn is one batch."""
-    algorithm = "ppo-lagrangian"
+    algorithm: AlgorithmName = "ppo-lagrangian"
     torch.manual_seed(0)
     env = make_env(config, num_envs=8, seed=0, algorithm=algorithm)
     training = ALGORITHMS[algorithm].build(env, config)
@@ -106,7 +106,7 @@ def run(*, quick: bool) -> list[Figure]:
                 f"SB3, {worlds} environments": many,
                 "SB3, 1 environment": one,
             }
-            times = race(contenders, rounds=rounds)
+            times = dict(race(contenders, rounds=rounds))
         ourselves = times.pop("PPO-Lagrangian")
         for name, seconds in times.items():
             bar = 3 if paper and name != "SB3, 1 environment" else None
