@@ -19,12 +19,22 @@ from benchmarks.handwritten import HandWritten, arguments
 from benchmarks.networks import ACTION, OBSERVATION, make_actor, make_critic, make_minibatch
 from benchmarks.report import Figure
 from benchmarks.timing import Contender, Times, quartiles, race, ratio, timed
+from benchmarks.whole import whole_update
 from torchrl_safe.objectives import PPOLagrangianLoss
 
 _OPTIONS: dict[str, Any] = {"entropy_bonus": False, "loss_critic_type": "l2"}
 # Stable-Baselines3's default, which the others share.
 _MAX_GRAD_NORM = 0.5
 _LEARNING_RATE = 3e-4
+# Nothing compiled; the loss compiled; and all that an update is.
+_KINDS = ("eager", "compiled", "one graph")
+# For minibatches of 64.
+_BARS = {
+    ("eager", "ClipPPOLoss, eager"): 1.5,
+    ("one graph", "hand-written, one graph"): 1.3,
+    ("one graph", "hand-written, eager"): 1.3,
+    ("one graph", "SB3"): 1.0,
+}
 
 
 class Bystander(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -64,24 +74,35 @@ def update(module: nn.Module, objective: Callable[[], Tensor]) -> Callable[[], N
     return step
 
 
-def updates(minibatch: TensorDictBase, *, compiled: bool) -> Iterator[tuple[str, Callable]]:
-    """The three updates by name."""
-    for name, module in (
-        ("hand-written", HandWritten()),
-        ("ClipPPOLoss", ClipPPOLoss(make_actor(), make_critic("state_value"), **_OPTIONS)),
-        (
-            "PPOLagrangianLoss",
-            PPOLagrangianLoss(
-                make_actor(), make_critic("state_value"), make_critic("cost_value"), **_OPTIONS
-            ),
+def modules() -> dict[str, tuple[nn.Module, Callable[..., Tensor]]]:
+    """What is trained and what is minimized, by name."""
+    by_hand = HandWritten()
+    losses = {
+        "ClipPPOLoss": ClipPPOLoss(make_actor(), make_critic("state_value"), **_OPTIONS),
+        "PPOLagrangianLoss": PPOLagrangianLoss(
+            make_actor(), make_critic("state_value"), make_critic("cost_value"), **_OPTIONS
         ),
-    ):
-        by_hand = isinstance(module, HandWritten)
-        objective: Callable[..., Tensor] = module if by_hand else summed(module)
-        inputs = arguments(minibatch) if by_hand else (minibatch,)
-        if compiled:
-            objective = torch.compile(objective, fullgraph=True)
-        yield name, update(module, partial(objective, *inputs))
+    }
+    return {
+        "hand-written": (by_hand, by_hand),
+        **{name: (loss, summed(loss)) for name, loss in losses.items()},
+    }
+
+
+def updates(minibatch: TensorDictBase, kind: str) -> dict[str, Callable[[], None]]:
+    """The three updates by name."""
+    steps: dict[str, Callable[[], None]] = {}
+    for name, (module, objective) in modules().items():
+        inputs = arguments(minibatch) if name == "hand-written" else (minibatch,)
+        if kind == "one graph":
+            options = {"learning_rate": _LEARNING_RATE, "max_grad_norm": _MAX_GRAD_NORM}
+            whole = torch.compile(whole_update(module, objective, **options), fullgraph=True)
+            steps[name] = partial(whole, *inputs)
+        else:
+            if kind == "compiled":
+                objective = torch.compile(objective, fullgraph=True)
+            steps[name] = update(module, partial(objective, *inputs))
+    return steps
 
 
 def stable_baselines(size: int, steps: int) -> dict[str, Contender]:
@@ -117,31 +138,32 @@ def run(*, quick: bool) -> list[Figure]:
     for size in (64,) if quick else (64, 256, 4096):
         steps, rounds = (2, 2) if quick else (max(2, 2048 // size), 25)
         minibatch = make_minibatch(size)
-        contenders = dict(stable_baselines(size, steps))
-        for compiled in (False,) if quick else (False, True):
-            for name, step in updates(minibatch, compiled=compiled):
-                kind = "compiled" if compiled else "eager"
+        contenders = stable_baselines(size, steps)
+        for kind in _KINDS[:1] if quick else _KINDS:
+            for name, step in updates(minibatch, kind).items():
                 contenders[f"{name}, {kind}"] = timed(step, calls=steps)
-        figures += summary(size, race(contenders, rounds=rounds))
+        # The backward pass is part of the graph; and the contenders share their source, from
+        # which only so many graphs would be made.
+        with torch._dynamo.config.patch(trace_autograd_ops=True, recompile_limit=64):
+            figures += summary(size, race(contenders, rounds=rounds))
     return figures
 
 
 def summary(size: int, times: Times) -> Iterator[Figure]:
     """The ratios that matter, and the milliseconds of each contender."""
-    others = times["SB3"] - times["SB3 sampling"]
-    for kind in ("eager", "compiled"):
+    rivals = {**times, "SB3": times["SB3"] - times["SB3 sampling"]}
+    bars = _BARS if size == 64 else {}
+    for kind in _KINDS:
         ours = times.get(f"PPOLagrangianLoss, {kind}")
         if ours is None:
             continue
-        bars: dict[str, float | None] = {"hand-written": None, "ClipPPOLoss": None, "SB3": None}
-        if size == 64:
-            key = {"eager": "ClipPPOLoss", "compiled": "hand-written"}[kind]
-            bars |= {key: {"eager": 1.5, "compiled": 1.3}[kind]}
-            bars |= {"SB3": 1.0} if kind == "compiled" else {}
-        for name, bar in bars.items():
-            theirs = others if name == "SB3" else times[f"{name}, {kind}"]
+        names = [f"hand-written, {kind}", "hand-written, eager", f"ClipPPOLoss, {kind}", "SB3"]
+        for name in dict.fromkeys(names):
             yield ratio(
-                f"minibatch {size}, {kind}: PPOLagrangianLoss / {name}", ours, theirs, at_most=bar
+                f"minibatch {size}: PPOLagrangianLoss, {kind} / {name}",
+                ours,
+                rivals[name],
+                at_most=bars.get((kind, name)),
             )
     yield from (
         quartiles(f"minibatch {size}: {name}", 1e3 * seconds, "ms")
