@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow compare paper sweep profile gallery lint format type clean
+.PHONY: train test test-slow compare paper sweep profile gallery bench lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -29,13 +29,16 @@ sweep: $(READY)  ## is the limit kept, whatever it is? goes on where it was stop
 profile: $(READY)  ## return and cost for fixed multipliers; goes on where it was stopped
 	$(BIN)/python -m experiments.multiplier_profile $(ARGS)
 
+bench: $(READY)  ## ratios against the physics floor and other libraries; wants a quiet machine
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
+
 gallery: $(READY)  ## the contact sheet of docs/environments.md
 	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/codespell torchrl_safe experiments tests tutorials docs *.md
+	$(BIN)/codespell torchrl_safe experiments benchmarks tests tutorials docs *.md
 
 format: $(READY)
 	$(BIN)/ruff check --fix .

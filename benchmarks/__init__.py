@@ -1,0 +1,1 @@
+"""Ratios against the physics floor, other libraries and hand-written code, each in one run."""

@@ -1,0 +1,244 @@
+"""Control steps of ``ArmEnv`` against bare physics, panda-gym and the original code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
+from itertools import product
+from typing import Any
+
+import gymnasium
+import numpy as np
+import panda_gym  # noqa: F401  (registers its environments)
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, GymEnv
+
+from benchmarks.floor import Tape
+from benchmarks.original import OriginalEnv
+from benchmarks.report import Figure
+from benchmarks.timing import Contender, quartiles, race, ratio, timed
+from experiments.agent import make_agent
+from torchrl_safe.envs import (
+    PAPER_CARTESIAN,
+    PAPER_JOINT,
+    ActionMode,
+    ArmEnv,
+    CartesianDelta,
+    JointDelta,
+    NoObstacles,
+    Scene,
+    paper_env,
+)
+
+_ACTIONS: dict[str, ActionMode] = {"joint": JointDelta(), "Cartesian": CartesianDelta()}
+_PAPER_ACTIONS: dict[str, ActionMode] = {"joint": PAPER_JOINT, "Cartesian": PAPER_CARTESIAN}
+# Shares of the floor's steps/s.
+_BARS = {("joint", 1): 0.5, ("joint", 12): 0.75, ("Cartesian", 1): 0.4, ("Cartesian", 12): 0.7}
+# An episode that no measurement reaches the end of: resets are timed apart.
+_ENDLESS = 10**9
+_PANDA_GYM_SUBSTEPS, _PANDA_GYM_EPISODE = 20, 50
+
+
+class Canned:
+    """A policy that plays the same random actions again and again.
+
+    Args:
+        env: where it plays.
+        steps: how many actions it has.
+    """
+
+    def __init__(self, env: EnvBase, steps: int) -> None:
+        generator = torch.Generator().manual_seed(0)
+        shape = (steps, *env.action_spec.shape)
+        self._actions = 2 * torch.rand(shape, generator=generator) - 1
+        self._step = 0
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict["action"] = self._actions[self._step % len(self._actions)]
+        self._step += 1
+        return tensordict
+
+
+def rollout(env: EnvBase, steps: int) -> Contender:
+    """Steps through ``rollout`` from a reset, which is not timed."""
+    policy = Canned(env, steps)
+
+    def contender() -> float:
+        env.set_seed(0)
+        start = env.reset()
+        return timed(lambda: play(env, policy, steps, start))()
+
+    return contender
+
+
+def play(env: EnvBase, policy: Canned, steps: int, start: TensorDictBase) -> None:
+    """Plays on from a state."""
+    env.rollout(steps, policy, auto_reset=False, tensordict=start, break_when_any_done=False)
+
+
+def episode(env: EnvBase, steps: int) -> Contender:
+    """Steps through ``rollout`` with the reset before them."""
+    policy = Canned(env, steps)
+    return timed(lambda: env.rollout(steps, policy, break_when_any_done=False))
+
+
+def floor(env: ArmEnv, steps: int) -> Contender:
+    """The physics of :func:`rollout` alone, on the same worlds."""
+    tape, policy = Tape(env.num_envs), Canned(env, steps)
+    env.set_seed(0)
+    start = env.reset()
+    with tape.recording():
+        play(env, policy, steps, start)
+
+    def contender() -> float:
+        env.set_seed(0)
+        env.reset()
+        return tape.play()
+
+    return contender
+
+
+def collection(env: EnvBase, steps: int) -> Contender:
+    """Steps through a collector with the policy that ``make train`` starts from."""
+    actor = make_agent(env, gamma=0.97).actor
+    frames = steps * env.batch_size.numel()
+    batches = iter(
+        Collector(
+            env,
+            actor,
+            frames_per_batch=frames,
+            total_frames=-1,
+            auto_register_policy_transforms=False,
+        )
+    )
+    return timed(lambda: next(batches))
+
+
+def against_floor(quick: bool) -> Iterator[Figure]:
+    """Rollout and collector against the bare steps of the same worlds."""
+    counts, rounds = ((2,), 2) if quick else ((1, 8, 32, 64), 15)
+    for (name, action), substeps, worlds in product(_ACTIONS.items(), (1, 12), counts):
+        steps = 8 if quick else max(16, (2048 if substeps == 1 else 512) // worlds)
+        env = ArmEnv(
+            num_envs=worlds, action=action, frame_skip=substeps, max_episode_steps=_ENDLESS
+        )
+        with closing(env):
+            times = race(
+                {
+                    "floor": floor(env, steps),
+                    "rollout": rollout(env, steps),
+                    "collector": collection(env, steps),
+                },
+                rounds=rounds,
+            )
+        case = f"{name}, substeps {substeps}, {worlds} worlds"
+        bar = _BARS[name, substeps] if worlds == 32 else None
+        yield ratio(f"{case}: rollout / floor", times["floor"], times["rollout"], at_least=bar)
+        yield ratio(f"{case}: collector / floor", times["floor"], times["collector"])
+        yield from (
+            quartiles(f"{case}: {way}", steps * worlds / seconds, "steps/s")
+            for way, seconds in times.items()
+        )
+
+
+def against_single_world(quick: bool) -> Iterator[Figure]:
+    """The collector with 32 worlds against the collector with one."""
+    worlds, steps, rounds = (4, 8, 2) if quick else (32, 128, 15)
+    settings: dict[str, Any] = {"action": JointDelta(), "frame_skip": 1}
+    with closing(ArmEnv(**settings)) as one, closing(ArmEnv(num_envs=worlds, **settings)) as many:
+        times = race(
+            {"one": collection(one, steps), "many": collection(many, steps)}, rounds=rounds
+        )
+    yield ratio(
+        f"joint, substeps 1: collector, {worlds} worlds / 1 world",
+        times["one"] * worlds,
+        times["many"],
+        at_least=15,
+    )
+
+
+def against_original(quick: bool) -> Iterator[Figure]:
+    """Whole episodes of 500 steps, resets included, against the original code."""
+    worlds, steps, rounds = (2, 8, 2) if quick else (32, 500, 7)
+    for name in _ACTIONS:
+        original = OriginalEnv("joint" if name == "joint" else "cartesian")
+        lean = ArmEnv(
+            num_envs=worlds, action=_ACTIONS[name], frame_skip=1, max_episode_steps=_ENDLESS
+        )
+        paper = paper_env(_PAPER_ACTIONS[name], num_envs=worlds, max_episode_steps=_ENDLESS)
+        actions = np.random.default_rng(0).uniform(-1, 1, (steps, 7 if name == "joint" else 4))
+        with closing(original), closing(lean), closing(paper):
+            times = race(
+                {
+                    "original": timed(partial(play_gym, original.reset, original.step, actions)),
+                    "lean": episode(lean, steps),
+                    "paper": episode(paper, steps),
+                },
+                rounds=rounds,
+            )
+        for scene, bar in (("lean", 5), ("paper", 3)):
+            yield ratio(
+                f"{name}, substeps 1, {worlds} worlds: {scene} scene / original code",
+                times["original"] * worlds,
+                times[scene],
+                at_least=bar,
+            )
+
+
+def against_panda_gym(quick: bool) -> Iterator[Figure]:
+    """Episodes of 50 steps of 20 substeps, resets included, against PandaReach-v3."""
+    worlds, rounds = (2, 2) if quick else (32, 15)
+    steps = 4 if quick else _PANDA_GYM_EPISODE
+    settings: dict[str, Any] = {
+        "num_envs": worlds,
+        "obstacles": NoObstacles(),
+        "frame_skip": _PANDA_GYM_SUBSTEPS,
+        "max_episode_steps": _PANDA_GYM_EPISODE,
+    }
+    theirs = gymnasium.make("PandaReach-v3")
+    wrapped = GymEnv("PandaReach-v3")
+    lean, fingers = ArmEnv(**settings), ArmEnv(scene=Scene(free_fingers=True), **settings)
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, 3)).astype(np.float32)
+    with closing(theirs), closing(wrapped), closing(lean), closing(fingers):
+        times = race(
+            {
+                "raw": timed(partial(play_gym, theirs.reset, theirs.step, actions)),
+                "GymEnv": episode(wrapped, steps),
+                "ArmEnv": episode(lean, steps),
+                "ArmEnv with movable fingers": episode(fingers, steps),
+            },
+            rounds=rounds,
+        )
+    for name, (theirs_name, bar) in product(
+        ("ArmEnv", "ArmEnv with movable fingers"), (("raw", 1.7), ("GymEnv", 2.0))
+    ):
+        yield ratio(
+            f"Cartesian, substeps {_PANDA_GYM_SUBSTEPS}, {worlds} worlds: {name} / "
+            f"panda-gym, {theirs_name}",
+            times[theirs_name] * worlds,
+            times[name],
+            at_least=bar if name == "ArmEnv" else None,
+        )
+
+
+def play_gym(
+    reset: Callable[[], Any], step: Callable[[np.ndarray], Any], actions: np.ndarray
+) -> None:
+    """Plays one episode."""
+    reset()
+    for action in actions:
+        step(action)
+
+
+def run(*, quick: bool) -> list[Figure]:
+    """Measures all of it."""
+    torch.set_num_threads(1)
+    return [
+        *against_floor(quick),
+        *against_single_world(quick),
+        *against_original(quick),
+        *against_panda_gym(quick),
+    ]

@@ -1,0 +1,118 @@
+"""Whole training, batch by batch, against Stable-Baselines3's PPO in the same environment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torchrl import torchrl_logger
+
+from benchmarks.report import Figure
+from benchmarks.timing import Contender, quartiles, race, ratio, timed
+from experiments.algorithms import ALGORITHMS
+from experiments.train import AlgorithmName, Config, collecting, make_env
+from torchrl_safe.envs import PAPER_JOINT, JointDelta, paper_env
+from torchrl_safe.envs.gym import ArmGymEnv
+
+# Stable-Baselines3 refuses the paper's actions, which have no bound.
+_BOUNDED = replace(PAPER_JOINT, bound=1e3)
+
+
+class PaperGymEnv(ArmGymEnv):
+    """The Gymnasium view of the paper's environment."""
+
+    def __init__(self) -> None:
+        env = paper_env(_BOUNDED)
+        env.close()
+        super().__init__(
+            arm=env.arm,
+            action=env.action_mode,
+            task=env.task,
+            obstacles=env.obstacles,
+            costs=env.costs,
+            observation=env._observation,
+            frame_skip=env.frame_skip,
+            max_episode_steps=env.max_episode_steps,
+            scene=env._scene,
+        )
+
+
+@contextmanager
+def ours(config: Config) -> Iterator[Contender]:
+    """PPO-Lagrangian as ``make train`` trains it in one process; a turn is one batch."""
+    algorithm: AlgorithmName = "ppo-lagrangian"
+    torch.manual_seed(0)
+    env = make_env(config, num_envs=8, seed=0, algorithm=algorithm)
+    training = ALGORITHMS[algorithm].build(env, config)
+    env.close()
+    with collecting(config, training.collector, algorithm) as collector:
+        batches = iter(collector)
+
+        def learn() -> None:
+            batch = next(batches)
+            assert training.updater is not None
+            training.updater.step(batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)])
+            training.learner.learn(batch)
+            collector.update_policy_weights_()
+
+        yield timed(learn)
+
+
+@contextmanager
+def stable_baselines(config: Config, envs: int) -> Iterator[Contender]:
+    """Stable-Baselines3's PPO with as many frames, minibatches and epochs."""
+    factory = PaperGymEnv if config.paper else partial(ArmGymEnv, action=JointDelta())
+    vector = DummyVecEnv([factory] * envs)
+    model = PPO(
+        "MlpPolicy",
+        vector,
+        n_steps=config.frames_per_batch // envs,
+        batch_size=config.minibatch,
+        n_epochs=config.epochs,
+        gamma=config.gamma,
+        learning_rate=config.learning_rate,
+        device="cpu",
+    )
+    try:
+        yield timed(lambda: model.learn(config.frames_per_batch, reset_num_timesteps=False))
+    finally:
+        vector.close()
+
+
+def run(*, quick: bool) -> list[Figure]:
+    """Measures all of it."""
+    torchrl_logger.setLevel("WARNING")
+    torch.set_num_threads(1)
+    rounds, worlds = (1, 2) if quick else (11, 32)
+    settings: dict[str, Any] = {"frames_per_batch": 64, "minibatch": 32} if quick else {}
+    figures: list[Figure] = []
+    for case, paper in (("paper's setting, 1 substep", True), ("default, 12 substeps", False)):
+        config = Config(action="joint", envs=worlds, workers=1, paper=paper, **settings)
+        # The collector must not come to its end.
+        config = replace(config, frames=config.frames_per_batch * (rounds + 2))
+        with (
+            ours(config) as torchrl_safe,
+            stable_baselines(config, worlds) as many,
+            stable_baselines(config, 1) as one,
+        ):
+            contenders = {
+                "PPO-Lagrangian": torchrl_safe,
+                f"SB3, {worlds} environments": many,
+                "SB3, 1 environment": one,
+            }
+            times = dict(race(contenders, rounds=rounds))
+        ourselves = times.pop("PPO-Lagrangian")
+        for name, seconds in times.items():
+            bar = 3 if paper and name != "SB3, 1 environment" else None
+            title = f"{case}: PPO-Lagrangian / {name}"
+            figures.append(ratio(title, seconds, ourselves, at_least=bar))
+        for name, seconds in {"PPO-Lagrangian": ourselves, **times}.items():
+            frames = config.frames_per_batch / seconds
+            figures.append(quartiles(f"{case}: {name}", frames, "frames/s"))
+    return figures
