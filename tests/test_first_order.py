@@ -231,6 +231,23 @@ def test_cup_projection_leads_back_to_the_improved_policy():
     assert loss.projection_loss(data)["kl"] < 0.01 * moved
 
 
+def test_a_coefficient_that_is_a_whole_number_is_still_a_number():
+    """A buffer of whole numbers would cut off what comes later."""
+    loss = build(IPOLoss, sharpness=20)
+    assert loss.sharpness.is_floating_point()
+    losses = loss(estimated(loss))
+    assert total(losses).isfinite()
+
+
+@pytest.mark.parametrize("make", [CUPLoss, FOCOPSLoss, P3OLoss])
+def test_targets_of_another_number_of_costs_are_refused(make):
+    loss = build(make, 2)
+    data = estimated(loss, 2)
+    data["cost_value_target"] = data["cost_value_target"][..., :1]
+    with pytest.raises(ValueError, match=r"'cost_value_target' must have one column .* 2 costs"):
+        loss(data)
+
+
 def surrogate_by_hand(loss, data):
     current, old = policy(loss, data), old_policy(data)
     ratio = (current.log_prob(data["action"]) - old.log_prob(data["action"])).exp().unsqueeze(-1)

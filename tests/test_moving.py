@@ -277,6 +277,11 @@ def rest_position(env):
             TypeError,
             "motion must be an instance of Motion, got",
         ),
+        (
+            lambda: Moving(InFront(), InFront()),
+            TypeError,
+            "motion must map times to displacements, got InFront",
+        ),
         (lambda: Moving(InFront(), Swing), TypeError, "motion must be an instance of Motion"),
         (lambda: Swing(amplitude=0), ValueError, "amplitude must be positive and finite, got 0"),
         (lambda: Swing(period=-1), ValueError, "period must be positive and finite, got -1"),

@@ -140,6 +140,7 @@ def test_at_the_radius_is_not_within_it(kind):
         ({"radius": 0}, ValueError, "radius must be positive and finite, got 0"),
         ({"distance": np.nan}, ValueError, "distance must be positive and finite, got nan"),
         ({"shape": Box()}, ValueError, r"shape must have a mass to be moved, got Box\("),
+        ({"shape": None}, TypeError, "shape must be an instance of Cylinder or Box or"),
         ({"shape": "box"}, TypeError, "shape must be an instance of Cylinder or Box or"),
         ({"region": (0, 1)}, TypeError, r"region must be an instance of Region, got \(0, 1\)"),
     ],
