@@ -11,6 +11,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from experiments.files import write_whole
+
 
 def missing(jobs: Mapping[Path, Any]) -> list[Path]:
     """The files of jobs that have not been run."""
@@ -47,7 +49,4 @@ def run_grid(
 
 
 def _run_and_keep(run: Callable[..., dict[str, Any]], path: Path, arguments: Any) -> None:
-    # A program that is stopped leaves no half of a file behind.
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(json.dumps(run(*arguments)))
-    unfinished.rename(path)
+    write_whole(path, json.dumps(run(*arguments)))

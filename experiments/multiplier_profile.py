@@ -61,6 +61,7 @@ def run(config: Config, rule: train.MultiplierRule, value: float, seed: int) -> 
         eval_episodes=config.eval_episodes,
         workers=1,
         out=config.out / "runs" / f"{rule}-{value:g}-{seed}",
+        resume=True,
     )
     _, result = train.train_and_evaluate(settings, "ppo-lagrangian", progress=False)
     return {"rule": rule, "value": value, "seed": seed, **result}

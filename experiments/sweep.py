@@ -64,6 +64,7 @@ def run(config: Config, action: train.Action, limit: float | None, seed: int) ->
         eval_episodes=config.eval_episodes,
         workers=1,
         out=config.out / "runs" / _name(action, limit, seed),
+        resume=True,
     )
     _, result = train.train_and_evaluate(settings, algorithm, progress=False)
     return {"action": action, "limit": limit, "seed": seed, **result}

@@ -10,6 +10,7 @@ from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.scene import Camera, Scene
+from torchrl_safe.envs.sensors import Vector
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 
@@ -74,21 +75,26 @@ class WorldBatch:
 
     def advance(self, joints: Array, fingers: Array) -> None:
         """Takes a control step towards joint targets ``(N, n)`` and finger targets ``(N, f)``."""
-        for row, (world, joint_target, finger_target) in enumerate(
-            zip(self.worlds, joints.tolist(), fingers.tolist(), strict=True)
-        ):
-            distances, forces, measured = world.advance(
-                joint_target, finger_target, self._frame_skip
-            )
-            self._contact_distance[row] = distances
-            self._contact_force[row] = forces
-            self._measured[row] = measured
-            self._rows[row] = world.read()
+        for row, targets in enumerate(zip(joints.tolist(), fingers.tolist(), strict=True)):
+            self.advance_row(row, *targets)
+
+    def advance_row(self, row: int, joints: Vector, fingers: Vector) -> None:
+        """Takes a control step in one world."""
+        world = self.worlds[row]
+        distances, forces, measured = world.advance(joints, fingers, self._frame_skip)
+        self._contact_distance[row] = distances
+        self._contact_force[row] = forces
+        self._measured[row] = measured
+        self._rows[row] = world.read()
+
+    def table(self) -> Array:
+        """Returns what each world was when it was last read, one row each."""
+        return np.array(self._rows)
 
     def state(self) -> ArmState:
         """Returns the state of all worlds."""
         return ArmState(
-            **split(np.array(self._rows), self._shapes),
+            **split(self.table(), self._shapes),
             joint_lower=self.worlds[0].joint_lower,
             joint_upper=self.worlds[0].joint_upper,
             obstacle_present=self._present.copy(),
