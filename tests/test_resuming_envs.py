@@ -42,6 +42,8 @@ ENVS = {
     "paper-cartesian": partial(paper_env, PAPER_CARTESIAN),
     "paper-joint": partial(paper_env, PAPER_JOINT),
 }
+# One with what is fixed, one with what rolls, one with what moves, one with what is carried.
+QUICK = {"default", "rolling", "moving", "pick-and-place", "paper-cartesian"}
 
 
 def play(env, actions, td):
@@ -64,7 +66,13 @@ def through_a_file(state, folder):
     return torch.load(folder / "state.pt", weights_only=True)
 
 
-@pytest.mark.parametrize("factory", ENVS.values(), ids=ENVS.keys())
+@pytest.mark.parametrize(
+    "factory",
+    [
+        pytest.param(factory, id=name, marks=() if name in QUICK else pytest.mark.slow)
+        for name, factory in ENVS.items()
+    ],
+)
 def test_a_loaded_environment_goes_on_bit_for_bit(make_env, tmp_path, factory):
     """With rows at different steps: some were reset before the others were done."""
     env = make_env(factory, num_envs=3, seed=3, max_episode_steps=9)

@@ -101,11 +101,12 @@ class RunCheckpoints:
         try:
             written = self._checkpoint.save(unfinished / path.name, metadata=metadata)
             _publish(written, path)
-        # That of torch.save does not say what the operating system does.
         except (OSError, RuntimeError) as error:
+            # That of torch.save says nothing of the disk.
+            free = shutil.disk_usage(self.folder).free
             raise OSError(
-                f"Checkpoint {path} could not be written: {error}. The newest before it is "
-                f"{self._rotation.latest()}."
+                f"Checkpoint {path} could not be written ({free:,} bytes are free there): {error}. "
+                f"The newest before it is {self._rotation.latest()}."
             ) from error
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
