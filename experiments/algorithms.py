@@ -72,6 +72,11 @@ class Training:
     updater: Updater | None
     learner: Learner
 
+    def state(self) -> dict[str, Any]:
+        """What has been learnt, and what it is learnt with, by name."""
+        state = self.learner.state()
+        return state if self.updater is None else {**state, "updater": self.updater}
+
 
 def keep_multiplier(loss: LossModule, config: Config) -> None:
     """No rule: the multiplier stays where it starts."""

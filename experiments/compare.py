@@ -55,6 +55,7 @@ def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]
                 eval_episodes=config.eval_episodes,
                 workers=1,
                 out=config.out / "runs" / str(seed),
+                resume=True,
             ),
             algorithm,
         )

@@ -13,6 +13,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from experiments.files import write_whole
+
 
 def missing(jobs: Mapping[Path, Any]) -> list[Path]:
     """The files of jobs that have not been run."""
@@ -73,11 +75,8 @@ def save_results(out: Path, config: Any, runs: Sequence[dict[str, Any]], table: 
 
 
 def _run_and_keep(run: Callable[..., dict[str, Any]], path: Path, arguments: Any) -> None:
-    # A program that is stopped leaves no half of a file behind.
-    unfinished = path.with_suffix(".unfinished")
     kept = {"arguments": _plain(arguments), "result": run(*arguments)}
-    unfinished.write_text(json.dumps(kept))
-    unfinished.rename(path)
+    write_whole(path, json.dumps(kept))
 
 
 def _check_same(path: Path, arguments: Any) -> None:

@@ -28,7 +28,10 @@ class Learner(Protocol):
         """Learns from a batch as a collector returns it."""
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
+        """What has been learnt, and what it is learnt with."""
+
+    def memory(self) -> dict[str, Any]:
+        """What else it needs to go on learning."""
 
 
 class NoiseSchedule:
@@ -130,6 +133,10 @@ class OnPolicyLearner:
         }
         return state if self.actor_step is None else {**state, "actor_step": self.actor_step}
 
+    def memory(self) -> dict[str, Any]:
+        # The sampler shuffles for the next pass as soon as one is over; the batch is forgotten.
+        return {"sampler": self.buffer.sampler}
+
 
 class ReplayLearner:
     """Keeps all batches and takes gradient steps on samples of them.
@@ -169,6 +176,9 @@ class ReplayLearner:
 
     def state(self) -> dict[str, Any]:
         return {"loss": self.loss, "optimizer": self.optimizer}
+
+    def memory(self) -> dict[str, Any]:
+        return {"buffer": self.buffer}
 
 
 def _descend(

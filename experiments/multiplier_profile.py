@@ -60,6 +60,7 @@ def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]
                 eval_episodes=config.eval_episodes,
                 workers=1,
                 out=config.out / "runs" / f"{rule}-{value:g}-{seed}",
+                resume=True,
             ),
             "ppo-lagrangian",
         )

@@ -64,6 +64,7 @@ def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]
                 eval_episodes=config.eval_episodes,
                 workers=1,
                 out=config.out / "runs" / _name(action, limit, seed),
+                resume=True,
             ),
             "ppo" if limit is None else "ppo-lagrangian",
         )

@@ -9,30 +9,32 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from time import perf_counter, strftime
 from typing import Any, Literal
 
 import torch
 import tyro
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
-from torchrl.checkpoint import Checkpoint
-from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
-from torchrl.objectives import LossModule
-from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, OffPolicy
 from experiments.evaluation import evaluate, summarize
+from experiments.files import write_whole
+from experiments.log import Log, figures, score
 from experiments.policy import save_policy
 from experiments.report import plot_curves, save_animation, save_picture, table
+from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
+from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import (
     PAPER_CARTESIAN,
     PAPER_JOINT,
@@ -87,6 +89,8 @@ ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointD
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
 COSTS = {"collision": Collision()}
+# What may be another when a run is resumed: it changes nothing in what is learnt.
+CHANGEABLE = ("algorithms", "out", "logger", "resume", "checkpoint_every")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,9 +122,14 @@ class Config:
     out: Path = dataclasses.field(
         default_factory=lambda: Path("runs", strftime("%Y-%m-%d_%H-%M-%S"))
     )
-    """New folder for logs, checkpoints, results.json and pictures; named by date and time."""
+    """Folder for logs, checkpoints, results.json and pictures; named by date and time."""
     logger: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
     """TorchRL logger; wandb and mlflow are to be installed by you."""
+    resume: bool = False
+    """Go on with the run in the folder where it was stopped, with the settings it has; if there
+    is none, begin it."""
+    checkpoint_every: int = 10
+    """Batches between two checkpoints: what a run that is stopped has to do again at most."""
     eval_episodes: int = 256
     """Episodes of the final evaluation, with the deterministic policy."""
     frames_per_batch: int = 1024
@@ -150,7 +159,7 @@ class Config:
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs")
-        for name in (*counts, "minibatch"):
+        for name in (*counts, "minibatch", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
         for name in ("learning_rate", "multiplier_rate"):
@@ -222,21 +231,32 @@ def collecting(
     """Opens TorchRL's collector, in this process or in workers, and shuts it down."""
     settings: dict[str, Any] = {
         "frames_per_batch": config.frames_per_batch,
-        "total_frames": config.frames,
+        # Collector closes its environment after the last frame: there would be no checkpoint then.
+        "total_frames": -1,
         "auto_register_policy_transforms": False,
     }
     if config.workers == 1:
         env = make_env(config, config.envs, algorithm=algorithm, training=True)
-        collector = Collector(env, policy, **settings)
+        collector = ResumableCollector(env, policy, **settings)
     else:
         worlds = config.envs // config.workers
         factory = partial(make_env, config, worlds, algorithm=algorithm, training=True)
-        collector = MultiSyncCollector([factory] * config.workers, policy, **settings)
+        collector = MultiSyncCollector(
+            [factory] * config.workers, policy, **settings, collector_class=ResumableCollector
+        )
     collector.set_seed(config.seed)
+    if config.workers == 1:
+        # The episodes that it has begun without a seed; with workers TorchRL does so itself.
+        collector.reset()
     try:
         yield collector
     finally:
         collector.shutdown()
+
+
+def settings(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Those fields of a configuration that a run keeps when it is resumed."""
+    return {name: value for name, value in fields.items() if name not in CHANGEABLE}
 
 
 def train(
@@ -251,51 +271,47 @@ def train(
     env = make_env(config, num_envs=8, seed=config.seed, algorithm=algorithm)
     training = ALGORITHMS[algorithm].build(env, config)
     env.close()
-    logger = get_logger(config.logger, str(config.out / "logs"), algorithm)
-    history, frames = [], 0
+    log = Log(config.logger, config.out / "logs", algorithm)
+    batches = math.ceil(config.frames / config.frames_per_batch)
     with (
         collecting(config, training.collector, algorithm) as collector,
         tqdm(
             total=config.frames, desc=algorithm, unit="frame", unit_scale=True, disable=not progress
         ) as bar,
     ):
-        for batch in collector:
+        checkpoints = RunCheckpoints(
+            config.out / algorithm / "checkpoints",
+            {
+                **training.state(),
+                **training.learner.memory(),
+                "collector": collector,
+                "log": log,
+                "generators": GlobalRNGState(),
+            },
+            settings={"algorithm": algorithm, **settings(dataclasses.asdict(config))},
+        )
+        if config.resume:
+            checkpoints.load()
+        else:
+            checkpoints.clear()
+        log.open()
+        bar.update(log.frames)
+        for batch in islice(collector, batches - len(log.rows)):
             episodes = batch["next"][batch["next", "done"].squeeze(-1)]
             if training.updater is not None:
                 training.updater.step(episodes["episode_cost"])
             training.learner.learn(batch)
             collector.update_policy_weights_()
-            frames += batch.numel()
             bar.update(batch.numel())
-            row = figures(episodes, training.loss)
+            row = figures(episodes, training.loss, tuple(COSTS))
             bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
-            logger.log_metrics(row, step=frames)
-            history.append({"frames": frames, **row})
-    state = training.learner.state()
-    if training.updater is not None:
-        state["updater"] = training.updater
-    Checkpoint(**state).save(config.out / algorithm / "checkpoint")
+            log.add({"frames": log.frames + batch.numel(), **row})
+            if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
+                recent = log.rows[-config.checkpoint_every :]
+                checkpoints.save(log.frames, score=score(recent, config.cost_limit))
     trained = {**json.loads(json.dumps(dataclasses.asdict(config), default=str)), "name": algorithm}
     save_policy(config.out / algorithm / "policy.pt", training.actor, training.actor_spec, trained)
-    return training.actor, history
-
-
-def figures(episodes: TensorDictBase, loss: LossModule) -> dict[str, float]:
-    """Means over the episodes that ended in a batch (none if no episode did), and multipliers."""
-    buffers = dict(loss.named_buffers())
-    multipliers = {}
-    if "lagrange_multiplier" in buffers:
-        values = buffers["lagrange_multiplier"].tolist()
-        multipliers = {f"multiplier/{n}": value for n, value in zip(COSTS, values, strict=True)}
-    if not len(episodes):
-        return multipliers
-    costs = episodes["episode_cost"].mean(0).tolist()
-    return {
-        "return": episodes["episode_reward"].mean().item(),
-        **{f"cost/{name}": cost for name, cost in zip(COSTS, costs, strict=True)},
-        "success": episodes["success"].float().mean().item(),
-        **multipliers,
-    }
+    return training.actor, log.rows
 
 
 def train_and_evaluate(
@@ -322,23 +338,40 @@ def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
     return train_and_evaluate(config, algorithm, progress=False)[1]
 
 
-def main(config: Config) -> None:
-    """Trains and evaluates each algorithm, then writes the comparison."""
-    if config.out.exists() and any(config.out.iterdir()):
-        raise FileExistsError(f"out must be a new or empty folder, got {str(config.out)!r}.")
-    config.out.mkdir(parents=True, exist_ok=True)
+def start(config: Config) -> dict[str, Any]:
+    """Begins a run, or reads what one that is resumed has finished."""
+    path = config.out / "results.json"
     results: dict[str, Any] = {
         "config": dataclasses.asdict(config),
         "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
         "algorithms": {},
     }
+    if config.resume and path.exists():
+        before = json.loads(path.read_text())
+        refuse_other_settings(settings(before["config"]), settings(results["config"]))
+        results["algorithms"] = before["algorithms"]
+    elif config.out.exists() and any(config.out.iterdir()):
+        raise FileExistsError(
+            f"out must be a new or empty folder, or with resume that of a run, got "
+            f"{str(config.out)!r}."
+        )
+    config.out.mkdir(parents=True, exist_ok=True)
+    write_whole(path, json.dumps(results, indent=1, default=str))
+    return results
+
+
+def main(config: Config) -> None:
+    """Trains and evaluates each algorithm, then writes the comparison."""
+    results = start(config)
     for algorithm in config.algorithms:
+        if algorithm in results["algorithms"]:
+            continue
         actor, results["algorithms"][algorithm] = train_and_evaluate(config, algorithm)
         stage = make_env(config, num_envs=1, seed=config.seed, algorithm=algorithm)
         save_picture(stage, config.out / "scene.png")
         save_animation(stage, actor, config.out / algorithm / "policy.gif")
         stage.close()
-        (config.out / "results.json").write_text(json.dumps(results, indent=1, default=str))
+        write_whole(config.out / "results.json", json.dumps(results, indent=1, default=str))
     plot_curves(results, config.out / "curves.png")
     text = table(results)
     (config.out / "table.md").write_text(text)

@@ -15,6 +15,7 @@ from torchrl.checkpoint import Checkpoint
 from experiments.agent import make_agent
 from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES
 from experiments.learners import NoiseSchedule
+from experiments.policy import load_policy
 from experiments.report import table
 from experiments.train import AlgorithmName, Config, main, make_env, train
 
@@ -88,7 +89,8 @@ def test_checkpoint_holds_the_loss(finished):
     results = json.loads((out / "results.json").read_text())
     loss = make_training().loss
     before = {key: value.clone() for key, value in loss.state_dict().items()}
-    Checkpoint(loss=loss).load(out / "ppo-lagrangian" / "checkpoint")
+    newest = max((out / "ppo-lagrangian" / "checkpoints").glob("*.torchrl"))
+    Checkpoint(loss=loss).load(newest, components=["loss"])
     last = results["algorithms"]["ppo-lagrangian"]["history"][-1]
     assert loss.lagrange_multiplier.item() == pytest.approx(last["multiplier/collision"])
     assert not torch.equal(
@@ -167,7 +169,10 @@ def test_every_algorithm_trains(algorithm, tmp_path):
         for old, new in zip(fresh.parameters(), actor.parameters(), strict=True)
     ]
     assert any(moved)
-    assert (tmp_path / algorithm / "checkpoint").exists()
+    assert (tmp_path / algorithm / "checkpoints" / "checkpoint-000000000512.torchrl").exists()
+    saved = load_policy(tmp_path / algorithm / "policy.pt").actor
+    for name, weight in actor.state_dict().items():
+        torch.testing.assert_close(saved.state_dict()[name], weight, rtol=0, atol=0)
 
 
 def test_what_ends_an_episode_early_ends_none_that_is_evaluated():

@@ -7,7 +7,7 @@ import torch
 from networks import make_batch, make_loss, make_networks
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives import IPOLoss, P3OLoss, ViolationUpdater
+from torchrl_safe.objectives import DualAscent, IPOLoss, P3OLoss, PIDControl, ViolationUpdater
 
 
 def make(num_costs=2, cost_limit=1.0, kind=P3OLoss):
@@ -112,3 +112,19 @@ def test_costs_that_cannot_be_used_change_nothing(cost, message):
     with pytest.raises(ValueError, match=message):
         updater.step(cost)
     assert loss.cost_violation.tolist() == [2.0, -1.0]
+
+
+def test_a_state_of_another_kind_of_updater_is_refused():
+    loss = LossModule()
+    loss.register_buffer("cost_violation", torch.zeros(1))
+    loss.register_buffer("lagrange_multiplier", torch.zeros(1))
+    updaters = (
+        ViolationUpdater(loss, cost_limit=1.0),
+        DualAscent(loss, cost_limit=1.0, lr=0.1),
+        PIDControl(loss, cost_limit=1.0, kp=1.0, ki=1.0, kd=1.0),
+    )
+    for one in updaters:
+        for other in updaters:
+            if other is not one:
+                with pytest.raises(ValueError, match=f"The state of a {type(one).__name__} has"):
+                    one.load_state_dict(other.state_dict())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial, reduce
@@ -26,6 +27,7 @@ from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.kinematics import distance_to_reach
 from torchrl_safe.envs.observations import FullObservation
 from torchrl_safe.envs.obstacles import InFront, Obstacles, Placement
+from torchrl_safe.envs.record import EpisodeRecord, pack, unpack
 from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Sensor
 from torchrl_safe.envs.tasks import Reach, Task
@@ -146,6 +148,7 @@ class ArmEnv(EnvBase):
             merged_links=scene.merged_links and not task.objects,
         )
         self._elapsed = np.zeros(num_envs, dtype=int)
+        self._record = EpisodeRecord(num_envs)
         self.set_seed(seed)
         sensors = {name: cost.sensing for name, cost in costs.items() if isinstance(cost, Sensor)}
         for name, sensing in sensors.items():
@@ -282,6 +285,7 @@ class ArmEnv(EnvBase):
         joints, fingers = self.action_mode.targets(action, self._state, self._worlds)
         if self._scene.motor_limits:
             joints, fingers = self._within_speed(joints, fingers)
+        self._record.add(self._elapsed, joints, fingers)
         self._batch.advance(joints, fingers)
         self._elapsed += 1
         self._state = state = self._batch.state()
@@ -314,6 +318,54 @@ class ArmEnv(EnvBase):
         """
         following = self._set_seed(seed)
         return seed if static_seed else following
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Returns what the running episodes are, as part of ``state_dict``."""
+        self._check_open()
+        arrays = {
+            "generators": np.stack([pack(generator) for generator in self._generators]),
+            "draws": self._record.draws,
+            "targets": self._record.targets[:, : self._elapsed.max()],
+            "elapsed": self._elapsed,
+            "state": self._batch.table(),
+        }
+        return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
+
+    def set_extra_state(self, state: Mapping[str, Tensor]) -> None:
+        """Plays the running episodes again up to where they were, as part of ``load_state_dict``.
+
+        Raises:
+            ValueError: if the state is of another number of worlds, or of another arm.
+        """
+        self._check_open()
+        joints = self._state.joint_position.shape[1]
+        saved = state["state"].numpy()
+        if saved.shape != (shape := self._batch.table().shape):
+            raise ValueError(
+                f"state must be of an environment like this one, whose worlds have the shape "
+                f"{shape}, got {saved.shape}."
+            )
+        for row, steps in enumerate(state["elapsed"].tolist()):
+            self._reset_world(row, unpack(state["draws"][row]))
+            for target in state["targets"][row, :steps].tolist():
+                self._batch.advance_row(row, target[:joints], target[joints:])
+        self._elapsed = state["elapsed"].numpy().copy()
+        self._record.targets = state["targets"].numpy().copy()
+        self._generators = [unpack(packed) for packed in state["generators"]]
+        self._state = self._batch.state()
+        if not np.array_equal(saved, after := self._batch.table()):
+            warnings.warn(
+                "The running episodes did not come back bit for bit, but with differences of up to "
+                f"{np.abs(after - saved).max():.1e} in their states: they are of another "
+                "environment, another version of PyBullet or another kind of processor.",
+                stacklevel=2,
+            )
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        # TorchRL's Collector saves nothing of an environment without transforms, and loads that.
+        return super().load_state_dict(state_dict, strict and bool(state_dict), assign)
 
     def render(self, width: int = 320, height: int = 240, camera: Camera = Camera()) -> Tensor:
         """Draws every world.
@@ -388,6 +440,7 @@ class ArmEnv(EnvBase):
         return placement
 
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:
+        self._record.begin(row, generator)
         goal, objects = self._draw_task(generator)
         for _ in range(_ATTEMPTS):
             placement = self._draw_obstacles(generator, goal, objects)

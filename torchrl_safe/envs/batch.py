@@ -12,7 +12,7 @@ from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.bullet import TOOL_MOTION, World
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.scene import Camera, Scene
-from torchrl_safe.envs.sensors import velocity_at
+from torchrl_safe.envs.sensors import Vector, velocity_at
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 
@@ -79,20 +79,25 @@ class WorldBatch:
 
     def advance(self, joints: Array, fingers: Array) -> None:
         """Takes a control step towards joint targets ``(N, n)`` and finger targets ``(N, f)``."""
-        contacts = [
-            world.advance(joint_target, finger_target, self._frame_skip)
-            for world, joint_target, finger_target in zip(
-                self.worlds, joints.tolist(), fingers.tolist(), strict=True
-            )
-        ]
-        distances, forces, measured = zip(*contacts, strict=True)
-        self._contact_distance, self._contact_force = np.array(distances), np.array(forces)
-        self._measured = [*measured]
-        self._rows = [world.read() for world in self.worlds]
+        for row, targets in enumerate(zip(joints.tolist(), fingers.tolist(), strict=True)):
+            self.advance_row(row, *targets)
+
+    def advance_row(self, row: int, joints: Vector, fingers: Vector) -> None:
+        """Takes a control step in one world."""
+        world = self.worlds[row]
+        distances, forces, measured = world.advance(joints, fingers, self._frame_skip)
+        self._contact_distance[row] = distances
+        self._contact_force[row] = forces
+        self._measured[row] = measured
+        self._rows[row] = world.read()
+
+    def table(self) -> Array:
+        """Returns what each world was when it was last read, one row each."""
+        return np.array(self._rows)
 
     def state(self) -> ArmState:
         """Returns the state of all worlds."""
-        row = split(np.array(self._rows), self._parts)
+        row = split(self.table(), self._parts)
         tool = [row["ee_position"], *(row.pop(name) for name in TOOL_MOTION)]
         velocity = velocity_at(*([*part.T] for part in tool))
         del row["finger_velocity"]

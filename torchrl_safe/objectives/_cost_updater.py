@@ -93,8 +93,12 @@ class CostUpdater(abc.ABC):
         """Loads a state that :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if the state is of another number of costs.
+            ValueError: if the state is of another kind of updater or another number of costs.
         """
+        if state_dict.keys() != (own := self.state_dict().keys()):
+            raise ValueError(
+                f"The state of a {type(self).__name__} has {sorted(own)}, got {sorted(state_dict)}."
+            )
         if state_dict["cost_limit"].shape != self.cost_limit.shape:
             raise ValueError(
                 f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "

@@ -1,0 +1,86 @@
+"""The figures of each batch of a run: in memory, in its checkpoints and in TorchRL's logger."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.objectives import LossModule
+from torchrl.record.loggers import get_logger
+
+
+class Log:
+    """A TorchRL logger that an interrupted run goes on with.
+
+    What was written after the last checkpoint is written a second time when the run goes on. So
+    the logger's files are begun anew then, with the rows of the checkpoint.
+
+    Args:
+        backend: name of TorchRL's logger.
+        folder: folder of logs.
+        name: name of the run in it.
+    """
+
+    def __init__(self, backend: str, folder: Path, name: str) -> None:
+        self.rows: list[dict[str, float]] = []
+        self._backend, self._folder, self._name = backend, folder, name
+
+    @property
+    def frames(self) -> int:
+        """Control steps so far."""
+        return int(self.rows[-1]["frames"]) if self.rows else 0
+
+    def open(self) -> None:
+        """Starts the logger."""
+        shutil.rmtree(self._folder / self._name, ignore_errors=True)
+        self._logger = get_logger(self._backend, str(self._folder), self._name)
+        for row in self.rows:
+            self._write(row)
+
+    def add(self, row: dict[str, float]) -> None:
+        """Adds a row of figures, among them ``frames``."""
+        self.rows.append(row)
+        self._write(row)
+
+    def _write(self, row: dict[str, float]) -> None:
+        figures = {name: value for name, value in row.items() if name != "frames"}
+        self._logger.log_metrics(figures, step=row["frames"])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"rows": list(self.rows)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.rows = list(state_dict["rows"])
+
+
+def figures(
+    episodes: TensorDictBase, loss: LossModule, cost_names: Sequence[str]
+) -> dict[str, float]:
+    """Means over the episodes that ended in a batch (none if no episode did), and multipliers."""
+    buffers = dict(loss.named_buffers())
+    multipliers = {}
+    if "lagrange_multiplier" in buffers:
+        values = buffers["lagrange_multiplier"].tolist()
+        multipliers = {f"multiplier/{n}": v for n, v in zip(cost_names, values, strict=True)}
+    if not len(episodes):
+        return multipliers
+    costs = episodes["episode_cost"].mean(0).tolist()
+    return {
+        "return": episodes["episode_reward"].mean().item(),
+        **{f"cost/{name}": cost for name, cost in zip(cost_names, costs, strict=True)},
+        "success": episodes["success"].float().mean().item(),
+        **multipliers,
+    }
+
+
+def score(rows: Sequence[dict[str, float]], limit: float) -> float | None:
+    """Mean return of some batches, if each of their mean costs is within the limit."""
+    ended = [row for row in rows if "return" in row]
+    costs = {name for row in ended for name in row if name.startswith("cost/")}
+    if not ended or any(fmean(row[name] for row in ended) > limit for name in costs):
+        return None
+    return fmean(row["return"] for row in ended)

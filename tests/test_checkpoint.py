@@ -1,0 +1,185 @@
+"""Checkpoints: what is kept, and what a torn, foreign, hostile or unwritable file does."""
+
+import json
+import pickle
+import resource
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import NonTensorData, TensorDict
+from torchrl.checkpoint import Checkpoint, CheckpointError
+
+from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
+
+
+@pytest.fixture
+def net():
+    return torch.nn.Linear(3, 2)
+
+
+@pytest.fixture
+def run(tmp_path, net):
+    return RunCheckpoints(tmp_path / "checkpoints", {"net": net}, settings={"arms": ("a", "b")})
+
+
+def save(run, net, step, **kwargs):
+    with torch.no_grad():
+        net.weight.fill_(step)
+    return run.save(step, **kwargs)
+
+
+def weight_after_load(run, net):
+    with torch.no_grad():
+        net.weight.fill_(-1)
+    run.load()
+    return net.weight.unique().tolist()
+
+
+def test_the_last_two_and_the_best_are_kept(run, net):
+    scores = {1: 1.0, 2: 5.0, 3: None, 4: float("nan"), 5: 2.0, 6: None}
+    paths = {step: save(run, net, step, score=score) for step, score in scores.items()}
+    assert sorted(run.folder.iterdir()) == [paths[2], paths[5], paths[6]]
+    assert run.best() == paths[2]
+    assert run.load() == 6
+    assert net.weight.unique().tolist() == [6]
+    Checkpoint(net=net).load(run.best())
+    assert net.weight.unique().tolist() == [2]
+
+
+def test_without_checkpoints_nothing_is_loaded(run, net):
+    before = net.weight.clone()
+    assert run.load() is None
+    assert torch.equal(before, net.weight)
+    assert run.best() is None
+    save(run, net, 1)
+    run.clear()
+    assert run.load() is None
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def flip_a_bit(path):
+    content = bytearray(path.read_bytes())
+    position = content.index(torch.full((6,), 2.0).numpy().tobytes())
+    content[position + 3] ^= 1
+    path.write_bytes(content)
+
+
+def without_a_part(path):
+    Checkpoint(format="archive", other=torch.nn.Linear(3, 2)).save(path)
+
+
+def of_another_network(path):
+    RunCheckpoints(path.parent, {"net": torch.nn.Linear(4, 2)}, settings={"arms": ["a", "b"]}).save(
+        2
+    )
+
+
+def of_another_run(path):
+    RunCheckpoints(path.parent, {"net": torch.nn.Linear(3, 2)}, settings={"arms": ["c"]}).save(2)
+
+
+@pytest.mark.parametrize(
+    ("harm", "reason"),
+    [
+        (cut, "Path does not contain|Invalid checkpoint|not a"),
+        (empty, "Path does not contain|Invalid checkpoint|not a"),
+        (flip_a_bit, "Bad CRC-32"),
+        (without_a_part, r"settings"),
+        (of_another_network, "size mismatch for weight"),
+        (of_another_run, r"arms was \['c'\] and is now \['a', 'b'\]"),
+    ],
+)
+def test_what_cannot_be_used_is_named_and_the_one_before_is_used(run, net, harm, reason):
+    first, second = (save(run, net, step) for step in (1, 2))
+    harm(second)
+    with pytest.warns(UserWarning, match=f"(?s){second}.*({reason})"):
+        assert weight_after_load(run, net) == [1]
+    # The run goes on, and writes in its place.
+    save(run, net, 2)
+    assert weight_after_load(run, net) == [2]
+    for path in (first, second):
+        cut(path)
+    with pytest.raises(CheckpointError, match=f"(?s)can be used.*{second}.*{first}"):
+        run.load()
+
+
+class Exploit:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("kind", ["pickle", "tensordict"])
+def test_loading_runs_no_foreign_code(run, net, tmp_path, kind):
+    path, proof = save(run, net, 1), tmp_path / "executed"
+    parts = tmp_path / "parts"
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(parts)
+        manifest = json.loads(archive.read("manifest.json"))
+    component = parts / manifest["components"]["net"]["path"]
+    (component / "state.pt").unlink()
+    if kind == "pickle":
+        (component / "state.pt").write_bytes(pickle.dumps(Exploit(proof)))
+    else:
+        TensorDict(a=NonTensorData(Exploit(proof))).memmap(component / "state")
+        (component / "state.json").write_text('{"kind": "dict", "items": []}')
+    proof.unlink(missing_ok=True)
+    files = [p.relative_to(component).as_posix() for p in component.rglob("*") if p.is_file()]
+    manifest["components"]["net"]["files"] = files
+    (parts / "manifest.json").write_text(json.dumps(manifest))
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in parts.rglob("*"):
+            archive.write(file, file.relative_to(parts))
+    with pytest.raises(CheckpointError, match=r"not what this class writes|[Ww]eights.only|pickle"):
+        run.load()
+    assert not proof.exists()
+
+
+def test_a_full_disk_leaves_the_one_before(run, net):
+    """The system itself refuses to write: files of this process cannot grow any more."""
+    first = save(run, net, 1)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match="could not be written") as failure:
+            save(run, net, 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "checkpoint-000000000002.torchrl could not be written (" in str(failure.value)
+    assert "bytes are free there)" in str(failure.value)
+    assert f"newest before it is {first}." in str(failure.value)
+    assert list(run.folder.iterdir()) == [first]
+    assert weight_after_load(run, net) == [1]
+
+
+def test_what_a_killed_process_left_is_cleared_away(run, net):
+    save(run, net, 1)
+    left = run.folder / ".unfinished" / "checkpoint-000000000002.torchrl"
+    left.parent.mkdir()
+    left.write_bytes(b"half")
+    assert run.load() == 1
+    save(run, net, 2)
+    assert not left.parent.exists()
+
+
+def test_settings_that_differ_are_named():
+    same = {"lr": 0.1, "seed": 0, "old": 1}
+    refuse_other_settings(same, dict(same))
+    with pytest.raises(ValueError, match=r"lr was 0.1 and is now 0.2, new was None and is now 3, "):
+        refuse_other_settings(same, {"lr": 0.2, "seed": 0, "new": 3})
+
+
+def test_settings_must_be_json(tmp_path, net):
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        RunCheckpoints(tmp_path, {"net": net}, settings={"path": tmp_path})

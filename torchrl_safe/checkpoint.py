@@ -1,0 +1,197 @@
+"""Checkpoints of a run that survive whatever stops it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    CheckpointRotation,
+    StateDictCheckpointAdapter,
+)
+
+# What Checkpoint raises itself, and what it lets through when a file is torn.
+_UNUSABLE = (CheckpointError, ValueError, OSError, zipfile.BadZipFile, EOFError)
+
+
+class RunCheckpoints:
+    """The checkpoints of one run: the last ones and the best, each a file of its own.
+
+    TorchRL's :class:`~torchrl.checkpoint.Checkpoint` reads and writes them, and its
+    :class:`~torchrl.checkpoint.CheckpointRotation` chooses which to keep. This makes them safe:
+
+    - A file has its name only once it is complete and on the disk: it is written under another
+      name, synced, then renamed. A process killed at any time leaves the last checkpoint intact.
+    - :meth:`load` takes the newest checkpoint that is whole (every file in it has a checksum)
+      and of this run; it warns about those it passes over, and raises if none is left.
+    - It reads tensors and plain values only, with ``weights_only``: loading runs no foreign code.
+      (``Checkpoint.load`` alone unpickles what a foreign file may hold.)
+
+    Args:
+        folder (Path): folder of the checkpoints, which is made when the first is saved.
+        components (Mapping[str, Any]): what has ``state_dict`` and ``load_state_dict``, by name.
+
+    Keyword Args:
+        settings (Mapping[str, Any], optional): what the run is made with, as JSON has it. A
+            checkpoint of a run with other settings is not loaded. Defaults to none.
+        keep_last (int, optional): how many of the last checkpoints to keep. Defaults to ``2``:
+            one to fall back on.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> folder = tempfile.mkdtemp()
+        >>> net = torch.nn.Linear(1, 1)
+        >>> checkpoints = RunCheckpoints(folder, {"net": net}, settings={"lr": 0.1})
+        >>> checkpoints.load() is None  # A run that starts.
+        True
+        >>> checkpoints.save(1, score=0.5).name
+        'checkpoint-000000000001.torchrl'
+        >>> checkpoints.load()
+        1
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        components: Mapping[str, Any],
+        *,
+        settings: Mapping[str, Any] | None = None,
+        keep_last: int = 2,
+    ) -> None:
+        self.folder = Path(folder)
+        # As they come back from a file: a tuple as a list.
+        self.settings: dict[str, Any] = json.loads(json.dumps(settings or {}))
+        self._rotation = CheckpointRotation(
+            self.folder, keep_last=keep_last, keep_best=("score", "max")
+        )
+        self._checkpoint = Checkpoint(format="archive")
+        for name, component in components.items():
+            adapter = StateDictCheckpointAdapter("torch")
+            self._checkpoint.register(name, component, adapter=adapter)
+
+    def save(self, step: int, *, score: float | None = None) -> Path:
+        """Saves all components.
+
+        Args:
+            step (int): how far the run is, in any unit; a later checkpoint has a larger one.
+            score (float, optional): how good it is; the checkpoint with the highest is kept
+                too. Without a score it is not the best.
+
+        Returns:
+            The file.
+
+        Raises:
+            OSError: if it could not be written, for example because the disk is full; those
+                before are intact.
+        """
+        scores = {} if score is None else {"score": score}
+        metadata = {"settings": self.settings, **scores}
+        path = self.folder / f"checkpoint-{step:012d}.torchrl"
+        unfinished = self.folder / ".unfinished"
+        shutil.rmtree(unfinished, ignore_errors=True)  # Of a process that was killed.
+        try:
+            written = self._checkpoint.save(unfinished / path.name, metadata=metadata)
+            _publish(written, path)
+        except (OSError, RuntimeError) as error:
+            # That of torch.save says nothing of the disk.
+            free = shutil.disk_usage(self.folder).free
+            raise OSError(
+                f"Checkpoint {path} could not be written ({free:,} bytes are free there): {error}. "
+                f"The newest before it is {self._rotation.latest()}."
+            ) from error
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+        self._rotation.prune()
+        return path
+
+    def load(self) -> int | None:
+        """Loads the newest checkpoint that can be used into all components.
+
+        Returns:
+            Its step, or None if there is no checkpoint.
+
+        Raises:
+            CheckpointError: if there are checkpoints, but none that can be used; it says of each
+                why not. The components may have changed then.
+        """
+        refused = []
+        for path in sorted(self.folder.glob("checkpoint-*.torchrl"), reverse=True):
+            try:
+                step = self._load(path)
+            except _UNUSABLE as error:
+                refused.append(f"{path}: {error}")
+                continue
+            if refused:
+                reasons = "\n".join(refused)
+                warnings.warn(f"Going on from {path}; not used:\n{reasons}", stacklevel=2)
+            return step
+        if refused:
+            reasons = "\n".join(refused)
+            raise CheckpointError(f"No checkpoint in {self.folder} can be used:\n{reasons}")
+        return None
+
+    def best(self) -> Path | None:
+        """The checkpoint with the highest score, if any has one."""
+        return self._rotation.best()
+
+    def clear(self) -> None:
+        """Removes all checkpoints."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _load(self, path: Path) -> int:
+        manifest = Checkpoint.manifest(path)
+        refuse_other_settings(manifest["metadata"].get("settings", {}), self.settings)
+        for name, component in manifest["components"].items():
+            if component["files"] != [StateDictCheckpointAdapter.state_torch]:
+                raise CheckpointError(
+                    f"component {name!r} is not what this class writes, but {component['files']}"
+                )
+        self._checkpoint.load(path)
+        return int(path.stem.removeprefix("checkpoint-"))
+
+
+def refuse_other_settings(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Compares the settings of a run that is to go on with those it had.
+
+    Args:
+        saved: the settings that the run had.
+        settings: those it is to go on with.
+
+    Raises:
+        ValueError: if they differ; it names the settings and both values.
+
+    Examples:
+        >>> refuse_other_settings({"lr": 0.1}, {"lr": 0.2})
+        Traceback (most recent call last):
+        ...
+        ValueError: the run has other settings: lr was 0.1 and is now 0.2
+    """
+    differences = [
+        f"{name} was {saved.get(name)!r} and is now {settings.get(name)!r}"
+        for name in dict.fromkeys((*settings, *saved))
+        if saved.get(name) != settings.get(name)
+    ]
+    if differences:
+        raise ValueError(f"the run has other settings: {', '.join(differences)}")
+
+
+def _publish(written: Path, path: Path) -> None:
+    """Gives a file its name, once all of it is on the disk."""
+    with written.open("rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(written, path)
+    if os.name == "posix":  # Elsewhere a folder cannot be opened.
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)

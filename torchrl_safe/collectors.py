@@ -1,0 +1,77 @@
+"""A collector that can be stopped and go on as if it had not been."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, TransformedEnv
+
+
+class ResumableCollector(Collector):
+    """TorchRL's collector, with a state that is complete.
+
+    The state of :class:`~torchrl.collectors.Collector` holds policy, transforms and counters:
+    one that is loaded starts all episodes anew. This one also holds the simulator's state, the
+    last observations with the running sums of :class:`~torchrl.envs.RewardSum` and all else that
+    is carried from step to step, and the state of torch's generator that the policy draws from.
+    A collector that is loaded between two batches then collects what the saved one would have
+    collected, bit for bit. It takes an environment whose ``state_dict`` is complete, such as
+    :class:`~torchrl_safe.envs.ArmEnv`, with any transforms around it, in this process or, as the
+    ``collector_class`` of :class:`~torchrl.collectors.MultiSyncCollector`, in workers (the
+    trajectories may have other numbers there). Other environments start their episodes anew.
+
+    Arguments are those of :class:`~torchrl.collectors.Collector`.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.envs import RewardSum, TransformedEnv
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> def make():
+        ...     env = TransformedEnv(ArmEnv(num_envs=2), RewardSum(["reward", "cost"]))
+        ...     policy = TensorDictModule(torch.nn.LazyLinear(3), ["observation"], ["action"])
+        ...     return ResumableCollector(
+        ...         env, policy, frames_per_batch=20, total_frames=40,
+        ...         auto_register_policy_transforms=False,
+        ...     )
+        >>> one, other = make(), make()
+        >>> first, state = next(iter(one)), one.state_dict()
+        >>> second = next(iter(one))
+        >>> other.load_state_dict(state)
+        >>> (next(iter(other)) == second).all()
+        True
+        >>> one.shutdown()
+        >>> other.shutdown()
+    """
+
+    _carrier: TensorDictBase
+
+    def state_dict(self) -> OrderedDict:
+        """Returns the state between two batches."""
+        state = super().state_dict()
+        state["base_env_state_dict"] = _innermost(self.env).state_dict()
+        state["carrier"] = self._carrier.exclude("next").clone().to_dict()
+        state["torch_generator"] = torch.get_rng_state()
+        return state
+
+    def load_state_dict(self, state_dict: OrderedDict, **kwargs: Any) -> None:
+        """Loads a state that :meth:`state_dict` returned."""
+        super().load_state_dict(state_dict, **kwargs)
+        if "traj_pool" in state_dict:  # The method above has drawn new numbers from it.
+            self._traj_pool.load_state_dict(state_dict["traj_pool"])
+        _innermost(self.env).load_state_dict(state_dict["base_env_state_dict"])
+        self._carrier = TensorDict(
+            state_dict["carrier"],
+            batch_size=self._carrier.batch_size,
+            device=self._carrier.device,
+        ).clone()
+        torch.set_rng_state(state_dict["torch_generator"])
+
+
+def _innermost(env: EnvBase) -> EnvBase:
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
