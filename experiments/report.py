@@ -69,7 +69,7 @@ def save_animation(
     env: EnvBase,
     policy: Callable[[TensorDictBase], TensorDictBase],
     path: Path,
-    episodes: int = 4,
+    episodes: int = 2,
 ) -> None:
     """Saves a GIF of the deterministic policy, at half speed."""
     frames: list[Image.Image] = []

@@ -10,8 +10,8 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
 from experiments.evaluation import evaluate, summarize
+from experiments.log import figures
 from experiments.report import table
-from experiments.train import figures
 from torchrl_safe.envs import ArmEnv, NoObstacles
 
 
@@ -92,10 +92,10 @@ def test_figures_of_a_batch():
     loss.register_buffer("lagrange_multiplier", torch.tensor([0.5]))
     multiplier = {"multiplier/collision": 0.5}
     expected = {"return": -3, "cost/collision": 0.5, "success": 0.75, **multiplier}
-    assert figures(episodes, loss) == expected
+    assert figures(episodes, loss, ("collision",)) == expected
     # No episode ended: no mean of nothing, which would be NaN.
-    assert figures(episodes[:0], loss) == multiplier
-    assert figures(episodes[:0], LossModule()) == {}, "not every algorithm has multipliers"
+    assert figures(episodes[:0], loss, ("collision",)) == multiplier
+    assert figures(episodes[:0], LossModule(), ()) == {}, "not every algorithm has multipliers"
 
 
 def test_table_of_hand_made_results():

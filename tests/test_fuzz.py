@@ -317,7 +317,7 @@ def test_updaters(drawn):
     updater = attempt(make, chosen)
     if updater is None:
         return
-    buffer = getattr(updater.loss_module, updater._buffer)
+    buffer = getattr(updater.loss_module, updater.buffer_name)
     for episode_cost in batches:
         before = buffer.clone()
         try:
@@ -326,7 +326,7 @@ def test_updaters(drawn):
             check_named(error, ("episode_cost", "next_multiplier"), (updater, episode_cost))
             assert torch.equal(buffer, before)
         assert buffer.isfinite().all()
-        assert (buffer >= 0).all() or updater._buffer == "cost_violation"
+        assert (buffer >= 0).all() or updater.buffer_name == "cost_violation"
 
 
 # ---------------------------------------------------------------- budgets and metrics

@@ -37,14 +37,14 @@ def test_only_what_is_missing_is_run(finished):
     path = finished.out / "AR1-PPO-0.json"
     stamps = {other: other.stat().st_mtime_ns for other in finished.out.glob("AR*.json")}
     assert not missing(jobs(finished))
-    first = json.loads(path.read_text())
+    first = json.loads(path.read_text())["result"]
     path.unlink()
     assert missing(jobs(finished)) == [path]
     assert len(missing(jobs(dataclasses.replace(finished, seeds=2)))) == 5
     main(finished)
     assert {other for other in stamps if other.stat().st_mtime_ns != stamps[other]} == {path}
     # Run again, it comes out the same.
-    again = json.loads(path.read_text())
+    again = json.loads(path.read_text())["result"]
     assert again["history"] == first["history"]
     assert again["evaluation"] == first["evaluation"]
 

@@ -42,8 +42,9 @@ def start():
 
     yield start_one
     for process in started:
-        process.kill()
-        process.communicate()
+        if process.returncode is None:
+            process.kill()
+            process.communicate()
 
 
 def make_train(out, *algorithms, **settings):

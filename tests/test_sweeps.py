@@ -20,6 +20,7 @@ def swept(tmp_path_factory):
     return config
 
 
+@pytest.mark.slow
 def test_sweep_leaves_table_figure_and_results(swept):
     results = json.loads((swept.out / "results.json").read_text())
     assert [run["limit"] for run in results["runs"]] == [0.5, None]

@@ -61,7 +61,7 @@ class Human:
         check_array("rest", self.rest, (3,))
         for name in ("duration", "pause"):
             shortest, longest = check_array(name, getattr(self, name), (2,))
-            check_positive(**{name: shortest})
+            check_positive(**{name: float(shortest)})
             if shortest > longest:
                 raise ValueError(f"{name} must be shortest, longest, got {shortest}, {longest}.")
         length = np.linalg.norm(np.subtract(self.rest, self.shoulder))
