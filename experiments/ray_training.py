@@ -1,0 +1,175 @@
+"""PPO-Lagrangian with two costs, its worlds spread over a Ray cluster: ``make ray``.
+
+The actors collect, this process learns: loss, optimizer and multipliers are here, so that an actor
+that dies takes nothing with it but the batch it was collecting. Without ``--address`` a cluster of
+two nodes, a head and a worker, is started on this machine. On a bigger one::
+
+    ray start --head   # on the others: ray start --address=...
+    python -m experiments.ray_training --address auto --actors 64
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from time import strftime
+from typing import Any
+
+import ray
+import torch
+import tyro
+from ray.cluster_utils import Cluster
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl import torchrl_logger
+from torchrl.collectors.distributed import RayCollector
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from tqdm import tqdm
+
+from experiments import train
+from experiments.algorithms import ALGORITHMS
+from experiments.log import Log, figures
+from torchrl_safe.envs import ArmEnv, Collision, Speed
+from torchrl_safe.objectives import DualAscent
+
+COSTS: dict[str, Any] = {"collision": Collision(), "speed": Speed(limit=0.5)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train with a limit on collisions and one on speed, on a Ray cluster."""
+
+    address: str | None = None
+    """Address of a Ray cluster, or "auto"; by default one of two nodes is started here."""
+    actors: int = 2
+    """Actors that collect."""
+    envs: int = 16
+    """Simulated worlds of each actor."""
+    cost_limits: tuple[float, float] = (0.5, 2.0)
+    """Limits of the expected cost of an episode: control steps in which the arm collides, and in
+    which the tool is faster than 0.5 m/s."""
+    frames: int = train.Config.frames
+    """Control steps to train for."""
+    frames_per_batch: int = train.Config.frames_per_batch
+    """Control steps between two updates of the policy."""
+    seed: int = 0
+    """Seed of networks and minibatches."""
+    out: Path = dataclasses.field(
+        default_factory=lambda: Path("runs", "ray", strftime("%Y-%m-%d_%H-%M-%S"))
+    )
+    """Folder for logs."""
+
+
+def make_env(num_envs: int) -> EnvBase:
+    """Makes an arm with two costs, and sums of reward and costs over each episode."""
+    env = ArmEnv(num_envs=num_envs, costs=COSTS)
+    return TransformedEnv(env, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
+
+
+@contextmanager
+def cluster(address: str | None) -> Iterator[str]:
+    """The address of a cluster: that which is given, or a head and a worker on this machine."""
+    if address is not None:
+        yield address
+        return
+    local = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    local.add_node(num_cpus=2)
+    try:
+        yield local.address
+    finally:
+        ray.shutdown()
+        local.shutdown()
+
+
+def make_collector(config: Config, policy: TensorDictModuleBase, address: str) -> RayCollector:
+    """Opens a collector whose actors are spread over the cluster."""
+    collector = RayCollector(
+        [partial(make_env, config.envs)] * config.actors,
+        policy,
+        frames_per_batch=config.frames_per_batch,
+        total_frames=-1,
+        sync=True,
+        collector_kwargs={"auto_register_policy_transforms": False},
+        ray_init_config={"address": address, "log_to_driver": False},
+        # TorchRL's own numbers reserve a GPU and 2 GiB for each.
+        remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 512 * 2**20},
+    )
+    collector.update_policy_weights_()
+    return collector
+
+
+class Collection:
+    """Batches without end; if an actor dies, new actors take the place of all.
+
+    Args:
+        config: the settings.
+        policy: the policy; its weights here are those that new actors begin with.
+        address: address of the cluster.
+    """
+
+    def __init__(self, config: Config, policy: TensorDictModuleBase, address: str) -> None:
+        self._make = partial(make_collector, config, policy, address)
+        self.collector = self._make()
+        #: How often actors had to be replaced.
+        self.replaced = 0
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        batches = iter(self.collector)
+        while True:
+            try:
+                yield next(batches)
+            except ray.exceptions.RayError as error:
+                torchrl_logger.warning(f"An actor died, new ones are started: {error}")
+                self.close()
+                self.collector, self.replaced = self._make(), self.replaced + 1
+                batches = iter(self.collector)
+
+    def close(self) -> None:
+        """Ends the actors; the cluster goes on."""
+        self.collector.shutdown(shutdown_ray=False)
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Trains; returns the last figures and how often actors were replaced."""
+    torchrl_logger.setLevel("WARNING")
+    torch.set_num_threads(1)
+    torch.manual_seed(config.seed)
+    settings = train.Config(
+        frames=config.frames, frames_per_batch=config.frames_per_batch, seed=config.seed
+    )
+    env = make_env(num_envs=8)
+    training = ALGORITHMS["ppo-lagrangian"].build(env, settings)
+    env.close()
+    updater = DualAscent(
+        training.loss,
+        cost_limit=torch.tensor(config.cost_limits),
+        lr=settings.multiplier_rate,
+        pessimism=settings.pessimism,
+        normalize=True,
+    )
+    log = Log("csv", config.out / "logs", "ppo-lagrangian")
+    log.open()
+    batches = math.ceil(config.frames / config.frames_per_batch)
+    with cluster(config.address) as address, tqdm(total=batches, unit="batch") as bar:
+        collection = Collection(config, training.collector, address)
+        try:
+            for batch, _ in zip(collection, range(batches), strict=False):
+                episodes = batch["next"][batch["next", "done"].squeeze(-1)]
+                updater.step(episodes["episode_cost"])
+                training.learner.learn(batch)
+                collection.collector.update_policy_weights_()
+                row = figures(episodes, training.loss, tuple(COSTS))
+                log.add({"frames": log.frames + batch.numel(), **row})
+                bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
+                bar.update()
+        finally:
+            collection.close()
+    return {**log.rows[-1], "replaced": collection.replaced}
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,60 @@
+"""Training on a real Ray cluster, a head and a worker on this machine, with an actor killed."""
+
+import csv
+
+import pytest
+import ray
+import torch
+
+from experiments import train
+from experiments.algorithms import ALGORITHMS
+from experiments.ray_training import COSTS, Collection, Config, cluster, main, make_env
+
+# Ray leaves sockets and files to the garbage collector when a cluster is shut down.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
+
+SMALL = Config(envs=2, frames=480, frames_per_batch=160)
+
+
+def test_two_costs_and_their_multipliers(tmp_path):
+    last = main(
+        Config(envs=2, frames=480, frames_per_batch=160, cost_limits=(0.0, 40.0), out=tmp_path)
+    )
+    assert last["frames"] == 480
+    assert last["replaced"] == 0
+    # No step of 40 is as fast as that; the other limit is exceeded as soon as there is a contact.
+    assert last["multiplier/speed"] == 0
+    (file,) = tmp_path.rglob("multiplier/collision.csv")
+    with file.open() as rows:
+        multipliers = [float(row[1]) for row in csv.reader(rows)]
+    assert len(multipliers) == 3
+    assert multipliers == sorted(multipliers)
+    assert multipliers[-1] == pytest.approx(last["multiplier/collision"])
+
+
+def test_an_actor_is_killed_on_the_way():
+    env = make_env(2)
+    training = ALGORITHMS["ppo-lagrangian"].build(env, train.Config(frames=480))
+    env.close()
+    with cluster(None) as address:
+        collection = Collection(SMALL, training.collector, address)
+        try:
+            batches = iter(collection)
+            first = next(batches)
+            nodes = {node["NodeID"] for node in ray.nodes() if node["Alive"]}
+            assert len(nodes) == 2
+            assert first["next", "cost"].shape == (2, 2, 40, len(COSTS))
+            with torch.no_grad():
+                for parameter in training.actor.parameters():
+                    parameter.fill_(0.125)
+            ray.kill(collection.collector.remote_collectors[0])
+            second = next(batches)
+            assert collection.replaced == 1
+            assert second.shape == first.shape
+            # The new actors have what was learnt: with these weights every action is the same one.
+            expected = training.actor(second.exclude("loc", "scale").clone())["loc"]
+            torch.testing.assert_close(second["loc"], expected)
+            assert len(next(batches)) == 2
+            assert collection.replaced == 1
+        finally:
+            collection.close()
