@@ -14,8 +14,6 @@ from benchmarks.original import OriginalEnv
 from benchmarks.parts import measure
 from benchmarks.report import Figure, record
 from benchmarks.timing import race, ratio, timed
-from benchmarks.update import update
-from benchmarks.whole import whole_update
 from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ArmEnv, paper_env
 from torchrl_safe.objectives import PPOLagrangianLoss
 
@@ -116,22 +114,6 @@ def test_hand_written_update_is_the_same_update():
         by_hand.policy[0].weight.grad,
         loss.actor_network_params["module", "0", "module", "0", "0", "weight"].grad,
     )
-
-
-def test_whole_update_is_clipping_and_adam():
-    torch.manual_seed(0)
-    plain, whole = HandWritten(), HandWritten()
-    whole.load_state_dict(plain.state_dict())
-    inputs = arguments(make_minibatch(64))
-    update_plain = update(plain, lambda: plain(*inputs))
-    update_whole = whole_update(whole, whole, learning_rate=3e-4, max_grad_norm=0.5)
-    start = plain.log_std.clone()
-    for _ in range(5):
-        update_plain()
-        update_whole(*inputs)
-    assert (plain.log_std != start).all()
-    for one, other in zip(plain.parameters(), whole.parameters(), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("part", ["reset", "update"])
