@@ -38,6 +38,9 @@ from torchrl_safe.objectives import DualAscent
 
 COSTS: dict[str, Any] = {"collision": Collision(), "speed": Speed(limit=0.5)}
 
+# More frames than any run takes; -1 means none at all here.
+_ENDLESS = 10**12
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -91,7 +94,7 @@ def make_collector(config: Config, policy: TensorDictModuleBase, address: str) -
         [partial(make_env, config.envs)] * config.actors,
         policy,
         frames_per_batch=config.frames_per_batch,
-        total_frames=-1,
+        total_frames=_ENDLESS,
         sync=True,
         collector_kwargs={"auto_register_policy_transforms": False},
         ray_init_config={"address": address, "log_to_driver": False},
