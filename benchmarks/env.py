@@ -119,9 +119,9 @@ def collection(env: EnvBase, steps: int) -> Contender:
 
 def against_floor(quick: bool) -> Iterator[Figure]:
     """Rollout and collector against the bare steps of the same worlds."""
-    counts, rounds = ((2,), 2) if quick else ((1, 8, 32, 64), 15)
+    counts, rounds = ((2,), 2) if quick else ((1, 8, 32, 64), 5)
     for (name, action), substeps, worlds in product(_ACTIONS.items(), (1, 12), counts):
-        steps = 8 if quick else max(16, (2048 if substeps == 1 else 512) // worlds)
+        steps = 8 if quick else max(16, (1024 if substeps == 1 else 256) // worlds)
         env = ArmEnv(
             num_envs=worlds, action=action, frame_skip=substeps, max_episode_steps=_ENDLESS
         )
@@ -146,7 +146,7 @@ def against_floor(quick: bool) -> Iterator[Figure]:
 
 def against_single_world(quick: bool) -> Iterator[Figure]:
     """The collector with 32 worlds against the collector with one."""
-    worlds, steps, rounds = (4, 8, 2) if quick else (32, 128, 15)
+    worlds, steps, rounds = (4, 8, 2) if quick else (32, 128, 7)
     settings: dict[str, Any] = {"action": JointDelta(), "frame_skip": 1}
     with closing(ArmEnv(**settings)) as one, closing(ArmEnv(num_envs=worlds, **settings)) as many:
         times = race(
@@ -162,7 +162,7 @@ def against_single_world(quick: bool) -> Iterator[Figure]:
 
 def against_original(quick: bool) -> Iterator[Figure]:
     """Whole episodes of 500 steps, resets included, against the original code."""
-    worlds, steps, rounds = (2, 8, 2) if quick else (32, 500, 7)
+    worlds, steps, rounds = (2, 8, 2) if quick else (32, 500, 3)
     for name in _ACTIONS:
         original = OriginalEnv("joint" if name == "joint" else "cartesian")
         lean = ArmEnv(
@@ -190,7 +190,7 @@ def against_original(quick: bool) -> Iterator[Figure]:
 
 def against_panda_gym(quick: bool) -> Iterator[Figure]:
     """Episodes of 50 steps of 20 substeps, resets included, against PandaReach-v3."""
-    worlds, rounds = (2, 2) if quick else (32, 15)
+    worlds, rounds = (2, 2) if quick else (32, 7)
     steps = 4 if quick else _PANDA_GYM_EPISODE
     settings: dict[str, Any] = {
         "num_envs": worlds,

@@ -89,7 +89,7 @@ def run(*, quick: bool) -> list[Figure]:
     """Measures all of it."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
-    rounds, worlds = (1, 2) if quick else (11, 32)
+    rounds, worlds = (1, 2) if quick else (5, 32)
     settings: dict[str, Any] = {"frames_per_batch": 64, "minibatch": 32} if quick else {}
     figures: list[Figure] = []
     for case, paper in (("paper's setting, 1 substep", True), ("default, 12 substeps", False)):

@@ -144,7 +144,7 @@ def run(*, quick: bool) -> list[Figure]:
     torch.manual_seed(0)
     figures: list[Figure] = []
     for size in (64,) if quick else (64, 256, 4096):
-        steps, rounds = (2, 2) if quick else (max(2, 2048 // size), 25)
+        steps, rounds = (2, 2) if quick else (max(2, 1024 // size), 15)
         minibatch = make_minibatch(size)
         rivals = stable_baselines(size, steps)
         # The contenders share their source, from which only so many graphs would be made.
