@@ -69,7 +69,7 @@ def save_results(out: Path, config: Any, runs: Sequence[dict[str, Any]], table: 
         "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
         "runs": runs,
     }
-    (out / "results.json").write_text(json.dumps(results, default=str))
+    write_whole(out / "results.json", json.dumps(results, default=str))
     (out / "table.md").write_text(table)
     print(f"\n{table}\nResults are in {out}.")
 

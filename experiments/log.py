@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
+from time import perf_counter
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -27,12 +28,20 @@ class Log:
 
     def __init__(self, backend: str, folder: Path, name: str) -> None:
         self.rows: list[dict[str, float]] = []
+        #: Seconds that the processes before this one have taken.
+        self.seconds_before = 0.0
+        self._start = perf_counter()
         self._backend, self._folder, self._name = backend, folder, name
 
     @property
     def frames(self) -> int:
         """Control steps so far."""
         return int(self.rows[-1]["frames"]) if self.rows else 0
+
+    @property
+    def seconds(self) -> float:
+        """Seconds so far, in all processes that the run has had."""
+        return self.seconds_before + perf_counter() - self._start
 
     def open(self) -> None:
         """Starts the logger."""
@@ -51,10 +60,11 @@ class Log:
         self._logger.log_metrics(figures, step=row["frames"])
 
     def state_dict(self) -> dict[str, Any]:
-        return {"rows": list(self.rows)}
+        return {"rows": list(self.rows), "seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.rows = list(state_dict["rows"])
+        self.seconds_before = state_dict["seconds"]
 
 
 def figures(

@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from time import strftime
 from typing import Any
@@ -38,6 +39,8 @@ from torchrl_safe.objectives import DualAscent
 
 COSTS: dict[str, Any] = {"collision": Collision(), "speed": Speed(limit=0.5)}
 
+# What an environment raises is another error, and ends the run.
+_DIED = (ray.exceptions.RayActorError, ray.exceptions.NodeDiedError)
 # More frames than any run takes; -1 means none at all here.
 _ENDLESS = 10**12
 
@@ -90,7 +93,7 @@ def cluster(address: str | None) -> Iterator[str]:
 
 def make_collector(config: Config, policy: TensorDictModuleBase, address: str) -> RayCollector:
     """Opens a collector whose actors are spread over the cluster."""
-    collector = RayCollector(
+    return RayCollector(
         [partial(make_env, config.envs)] * config.actors,
         policy,
         frames_per_batch=config.frames_per_batch,
@@ -101,12 +104,10 @@ def make_collector(config: Config, policy: TensorDictModuleBase, address: str) -
         # TorchRL's own numbers reserve a GPU and 2 GiB for each.
         remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 512 * 2**20},
     )
-    collector.update_policy_weights_()
-    return collector
 
 
 class Collection:
-    """Batches without end; if an actor dies, new actors take the place of all.
+    """Batches without end, each with the policy as it is; new actors take the place of dead ones.
 
     Args:
         config: the settings.
@@ -121,15 +122,21 @@ class Collection:
         self.replaced = 0
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        batches = iter(self.collector)
+        batches, fresh = iter(self.collector), True
         while True:
             try:
-                yield next(batches)
-            except ray.exceptions.RayError as error:
+                self.collector.update_policy_weights_()
+                batch = next(batches)
+            except _DIED as error:
+                if fresh:  # They would die again and again.
+                    raise
                 torchrl_logger.warning(f"An actor died, new ones are started: {error}")
                 self.close()
                 self.collector, self.replaced = self._make(), self.replaced + 1
-                batches = iter(self.collector)
+                batches, fresh = iter(self.collector), True
+                continue
+            fresh = False
+            yield batch
 
     def close(self) -> None:
         """Ends the actors; the cluster goes on."""
@@ -154,17 +161,18 @@ def main(config: Config) -> dict[str, Any]:
         pessimism=settings.pessimism,
         normalize=True,
     )
+    if config.out.exists() and any(config.out.iterdir()):
+        raise FileExistsError(f"out must be a new or empty folder, got {str(config.out)!r}.")
     log = Log("csv", config.out / "logs", "ppo-lagrangian")
     log.open()
     batches = math.ceil(config.frames / config.frames_per_batch)
     with cluster(config.address) as address, tqdm(total=batches, unit="batch") as bar:
         collection = Collection(config, training.collector, address)
         try:
-            for batch, _ in zip(collection, range(batches), strict=False):
+            for batch in islice(collection, batches):
                 episodes = batch["next"][batch["next", "done"].squeeze(-1)]
                 updater.step(episodes["episode_cost"])
                 training.learner.learn(batch)
-                collection.collector.update_policy_weights_()
                 row = figures(episodes, training.loss, tuple(COSTS))
                 log.add({"frames": log.frames + batch.numel(), **row})
                 bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})

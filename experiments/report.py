@@ -45,7 +45,8 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
     figure, grid = plt.subplots(1, 1 + len(costs), figsize=size, squeeze=False)
     axes = list(grid[0])
     for axis, key in zip(axes, ["return", *costs], strict=True):
-        for (name, run), colour in zip(runs.items(), COLOURS, strict=False):
+        for index, (name, run) in enumerate(runs.items()):
+            colour = COLOURS[index] if index < len(COLOURS) else plt.get_cmap("tab20")(index)
             rows = [row for row in run["history"] if key in row]
             axis.plot([r["frames"] for r in rows], [r[key] for r in rows], color=colour, label=name)
         axis.set(xlabel="frames", ylabel=f"episode {key.replace('/', ': ')}")

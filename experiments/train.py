@@ -15,7 +15,7 @@ from functools import partial
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from time import perf_counter, strftime
+from time import strftime
 from typing import Any, Literal
 
 import torch
@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, OffPolicy
 from experiments.evaluation import evaluate, summarize
-from experiments.files import write_whole
+from experiments.files import UNFINISHED, write_whole
 from experiments.log import Log, figures, score
 from experiments.policy import save_policy
 from experiments.report import plot_curves, save_animation, save_picture, table
@@ -261,8 +261,8 @@ def settings(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 def train(
     config: Config, algorithm: AlgorithmName, *, progress: bool = True
-) -> tuple[TensorDictModuleBase, list[dict[str, float]]]:
-    """Trains with one algorithm; returns the policy and a row of figures for each batch."""
+) -> tuple[TensorDictModuleBase, Log]:
+    """Trains with one algorithm; returns the policy and the figures of each batch."""
     # TorchRL's notes on each buffer would break up the progress bar.
     torchrl_logger.setLevel("WARNING")
     # The networks are small: more threads than one only wait for each other.
@@ -311,23 +311,22 @@ def train(
                 checkpoints.save(log.frames, score=score(recent, config.cost_limit))
     trained = {**json.loads(json.dumps(dataclasses.asdict(config), default=str)), "name": algorithm}
     save_policy(config.out / algorithm / "policy.pt", training.actor, training.actor_spec, trained)
-    return training.actor, log.rows
+    return training.actor, log
 
 
 def train_and_evaluate(
     config: Config, algorithm: AlgorithmName, *, progress: bool = True
 ) -> tuple[TensorDictModuleBase, dict[str, Any]]:
     """Trains with one algorithm and plays with what it has learnt; returns policy and results."""
-    start = perf_counter()
-    actor, history = train(config, algorithm, progress=progress)
-    seconds = perf_counter() - start
+    actor, log = train(config, algorithm, progress=progress)
+    seconds = log.seconds
     env = make_env(config, num_envs=32, algorithm=algorithm)
     # Seeds that training does not use.
     episodes = evaluate(env, actor, config.eval_episodes, seed=config.seed + 1_000_000)
     env.close()
     return actor, {
         "seconds": seconds,
-        "history": history,
+        "history": log.rows,
         "evaluation": summarize(episodes, tuple(COSTS)),
         "episodes": {name: value.tolist() for name, value in episodes.items()},
     }
@@ -350,7 +349,7 @@ def start(config: Config) -> dict[str, Any]:
         before = json.loads(path.read_text())
         refuse_other_settings(settings(before["config"]), settings(results["config"]))
         results["algorithms"] = before["algorithms"]
-    elif config.out.exists() and any(config.out.iterdir()):
+    elif config.out.exists() and any(file.suffix != UNFINISHED for file in config.out.iterdir()):
         raise FileExistsError(
             f"out must be a new or empty folder, or with resume that of a run, got "
             f"{str(config.out)!r}."

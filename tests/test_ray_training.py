@@ -47,6 +47,7 @@ def test_an_actor_is_killed_on_the_way():
             with torch.no_grad():
                 for parameter in training.actor.parameters():
                     parameter.fill_(0.125)
+            # While the learner learns: the next thing it does is to send its weights.
             ray.kill(collection.collector.remote_collectors[0])
             second = next(batches)
             assert collection.replaced == 1

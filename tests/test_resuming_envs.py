@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import Compose, RewardSum, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, GymEnv, RewardSum, SerialEnv, TransformedEnv
 
 from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import (
@@ -250,6 +250,37 @@ def test_without_transforms_and_as_torchrls_own(make_env):
         next(iter(one))
         two.load_state_dict(one.state_dict())
         assert len(list(two)) == 4
+        one.shutdown()
+        two.shutdown()
+
+
+def pendulum():
+    return TransformedEnv(GymEnv("Pendulum-v1"), RewardSum(["reward"]))
+
+
+def two_with_transforms():
+    return SerialEnv(2, [partial(make_training_env, 1)] * 2)
+
+
+@pytest.mark.parametrize("make", [pendulum, two_with_transforms])
+def test_environments_without_a_state_begin_anew(make):
+    """Sums and observations too: not those of an episode that the simulator knows nothing of."""
+    settings = {**SETTINGS, "frames_per_batch": 10}
+
+    def collector():
+        env = make()
+        actions = env.action_spec.shape[-1]
+        policy = TensorDictModule(torch.nn.LazyLinear(actions), ["observation"], ["action"])
+        return ResumableCollector(env, policy, **settings)
+
+    one, two = collector(), collector()
+    try:
+        next(iter(one))
+        two.load_state_dict(one.state_dict())
+        batch = next(iter(two)).reshape(-1, 10 // (1 if make is pendulum else 2))
+        sums, rewards = batch["next", "episode_reward"], batch["next", "reward"]
+        torch.testing.assert_close(sums[:, 0], rewards[:, 0])
+    finally:
         one.shutdown()
         two.shutdown()
 

@@ -160,8 +160,8 @@ def test_every_algorithm_trains(algorithm, tmp_path):
     config = Config(
         frames=512, frames_per_batch=256, envs=16, workers=1, epochs=1, out=tmp_path, gamma=0.9
     )
-    actor, history = train(config, algorithm, progress=False)
-    assert [row["frames"] for row in history] == [256, 512]
+    actor, log = train(config, algorithm, progress=False)
+    assert [row["frames"] for row in log.rows] == [256, 512]
     torch.manual_seed(0)
     fresh = make_training(algorithm, gamma=0.9).actor
     moved = [

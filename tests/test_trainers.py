@@ -349,6 +349,8 @@ def test_discounts(make_arm):
     for estimator in (arm.loss.value_estimator, arm.loss.cost_value_estimator):
         assert estimator.gamma.item() == pytest.approx(0.9)
         assert estimator.lmbda.item() == pytest.approx(0.8)
+    with pytest.raises(ValueError, match=r"gamma and lmbda must be given together, got 0\.9"):
+        arm.safe_trainer(gamma=0.9)
 
 
 PID = {"cost_limit": 2.0, "kp": 0.5, "ki": 0.1, "kd": 0.5}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -22,7 +23,8 @@ class ResumableCollector(Collector):
     collected, bit for bit. It takes an environment whose ``state_dict`` is complete, such as
     :class:`~torchrl_safe.envs.ArmEnv`, with any transforms around it, in this process or, as the
     ``collector_class`` of :class:`~torchrl.collectors.MultiSyncCollector`, in workers (the
-    trajectories may have other numbers there). Other environments start their episodes anew.
+    trajectories may have other numbers there). Environments whose state has no
+    ``get_extra_state`` in it start their episodes anew.
 
     Arguments are those of :class:`~torchrl.collectors.Collector`.
 
@@ -52,8 +54,10 @@ class ResumableCollector(Collector):
     def state_dict(self) -> OrderedDict:
         """Returns the state between two batches."""
         state = super().state_dict()
-        state["base_env_state_dict"] = _innermost(self.env).state_dict()
-        state["carrier"] = self._carrier.exclude("next").clone().to_dict()
+        simulator = _innermost(self.env).state_dict()
+        if _is_complete(simulator):
+            state["base_env_state_dict"] = simulator
+            state["carrier"] = self._carrier.exclude("next").clone().to_dict()
         state["torch_generator"] = torch.get_rng_state()
         return state
 
@@ -62,13 +66,22 @@ class ResumableCollector(Collector):
         super().load_state_dict(state_dict, **kwargs)
         if "traj_pool" in state_dict:  # The method above has drawn new numbers from it.
             self._traj_pool.load_state_dict(state_dict["traj_pool"])
-        _innermost(self.env).load_state_dict(state_dict["base_env_state_dict"])
-        self._carrier = TensorDict(
-            state_dict["carrier"],
-            batch_size=self._carrier.batch_size,
-            device=self._carrier.device,
-        ).clone()
+        if "carrier" in state_dict:
+            _innermost(self.env).load_state_dict(state_dict["base_env_state_dict"])
+            self._carrier = TensorDict(
+                state_dict["carrier"],
+                batch_size=self._carrier.batch_size,
+                device=self._carrier.device,
+            ).clone()
         torch.set_rng_state(state_dict["torch_generator"])
+
+
+def _is_complete(state: Mapping[str, Any]) -> bool:
+    """Whether it holds what ``get_extra_state`` gives; other environments save settings only."""
+    return any(
+        name.endswith("_extra_state") or (isinstance(part, Mapping) and _is_complete(part))
+        for name, part in state.items()
+    )
 
 
 def _innermost(env: EnvBase) -> EnvBase:

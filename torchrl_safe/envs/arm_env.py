@@ -335,7 +335,7 @@ class ArmEnv(EnvBase):
         """Plays the running episodes again up to where they were, as part of ``load_state_dict``.
 
         Raises:
-            ValueError: if the state is of another number of worlds, or of another arm.
+            ValueError: if the state has another number of worlds, or of numbers in each.
         """
         self._check_open()
         joints = self._state.joint_position.shape[1]

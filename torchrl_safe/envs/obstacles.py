@@ -57,7 +57,7 @@ class Placement:
         count = len(self.position) if np.iterable(self.position) else 0
         upright = np.tile(UPRIGHT, (count, 1))
         present = np.ones(count, bool) if self.present is None else np.asarray(self.present)
-        if present.dtype != bool:
+        if count and present.dtype != bool:
             raise ValueError(f"present must be bool, got {self.present!r}.")
         if not (self.path is None or callable(self.path)):
             raise TypeError(f"path must be callable, got {self.path!r}.")

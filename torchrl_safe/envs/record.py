@@ -44,7 +44,10 @@ class EpisodeRecord:
         """
         targets = np.concatenate([joints, fingers], axis=1)
         count, room, _ = self.targets.shape
-        if (last := int(elapsed.max())) >= room:
+        last = int(elapsed.max())
+        if not last:  # A long episode before leaves nothing behind.
+            self.targets, room = self.targets[:, :0], 0
+        if last >= room:
             longer = np.zeros((count, max(32, 2 * last), targets.shape[1]))
             if room:
                 longer[:, :room] = self.targets

@@ -23,9 +23,10 @@ class Scene:
         target_urdf: body of the target, free to move; the goal is then read from the
             simulator. ``None`` makes the target a mere point.
         free_fingers: leave the joints that are not part of the arm movable.
-        merged_links: simulate links that fixed joints hold together as one: the same body, with
-            the contact properties of its first link, for a fifth to a third less of a physics
-            step. Not done where the task moves objects, whose grip depends on these properties.
+        merged_links: simulate links that fixed joints hold together as one, with
+            the contact properties of the first link, for a fifth to a third less of a physics
+            step. With ``urdf_inertia`` it is the same body; else its inertia is that of another
+            box. Not done where the task moves objects, whose grip depends on these properties.
         motor_limits: keep the motors within the efforts and speeds of the URDF.
         motor_gain: share of the way to the joint targets that the motors ask for in each
             physics substep. ``None`` asks for the speed that is there at the end of the control

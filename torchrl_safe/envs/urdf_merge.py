@@ -14,7 +14,9 @@ _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 def merge_fixed_links(root: Element, keep: str) -> None:
     """Merges every link that a fixed joint holds into the link that holds it.
 
-    Shapes move over, masses and inertias add up. It is the same body, only cheaper to simulate.
+    Shapes move over, masses and inertias add up: it is the same body, only cheaper to simulate.
+    (But PyBullet reads inertias only with ``Scene.urdf_inertia``; else it makes its own of the box
+    around a link's shapes, which is another one when there are more shapes.)
 
     Args:
         root: a URDF; changed in place.
@@ -65,8 +67,8 @@ def _add_inertia(holder: Element, held: Element, frame: Array) -> None:
 def _inertia(link: Element, frame: Array) -> tuple[float, Array, Array]:
     """Mass, kg, centre, m, and inertia about it, kg m^2, of a link as seen from a frame."""
     inertial = link.find("inertial")
-    if inertial is None:
-        return 0.0, frame[:3, 3], np.zeros((3, 3))
+    if inertial is None:  # What PyBullet makes of it.
+        return 1.0, frame[:3, 3], np.eye(3)
     pose = frame @ _frame(inertial)
     mass = float(inertial.find("mass").get("value", 0))  # type: ignore[union-attr]
     moments = inertial.find("inertia")

@@ -41,7 +41,7 @@ class CostUpdater(abc.ABC):
             )
         if not limit.isfinite().all():
             raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
-        check_number("pessimism", pessimism)
+        pessimism = check_number("pessimism", pessimism)
         self.loss_module = loss_module
         self.cost_limit = limit.expand_as(buffer).clone()
         self.pessimism = pessimism

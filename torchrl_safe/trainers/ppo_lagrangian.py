@@ -33,10 +33,10 @@ class PPOLagrangianTrainer(PPOTrainer):
             environment repeats within a step.
         optim_steps_per_batch (int, optional): steps of the optimizer in an epoch. Defaults to
             ``None``, all minibatches of the replay buffer.
-        gamma (float, optional): discount of reward and costs. Defaults to what ``loss_module``
-            has.
-        lmbda (float, optional): trace decay of reward and costs. Defaults to what
+        gamma (float, optional): discount of reward and costs, with ``lmbda``. Defaults to what
             ``loss_module`` has.
+        lmbda (float, optional): trace decay of reward and costs, with ``gamma``. Defaults to
+            what ``loss_module`` has.
         add_gae (bool, optional): whether advantages are estimated here. Defaults to ``True``.
         gae (callable, optional): estimates both advantages of a batch. Defaults to
             ``loss_module.estimate_advantages``.
@@ -123,11 +123,11 @@ class PPOLagrangianTrainer(PPOTrainer):
         hook = MultiplierHook(
             updater, episode_cost_key=episode_cost_key, done_key=done_key, cost_names=cost_names
         )
-        given = {"gamma": gamma, "lmbda": lmbda}
-        hyperparams = {name: value for name, value in given.items() if value is not None}
-        if hyperparams:
-            loss_module.make_value_estimator(**hyperparams)
-            loss_module.make_cost_value_estimator(**hyperparams)
+        if (gamma is None) != (lmbda is None):
+            raise ValueError(f"gamma and lmbda must be given together, got {gamma} and {lmbda}.")
+        if gamma is not None:
+            loss_module.make_value_estimator(gamma=gamma, lmbda=lmbda)
+            loss_module.make_cost_value_estimator(gamma=gamma, lmbda=lmbda)
         super().__init__(
             loss_module=loss_module,
             frame_skip=frame_skip,
