@@ -513,13 +513,8 @@ def test_every_rule_moves_the_multiplier(make, rule):
 # tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
 @pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
 # The calls of CUP and IPO add nothing to trace to that of PPOLagrangianLoss and of P3O.
-@pytest.mark.parametrize(
-    "name",
-    [
-        "focops",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("cup-projection", "p3o", "crpo")),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["focops", "cup-projection", "p3o", "crpo"])
 def test_compiles_to_one_graph_that_sees_the_costs_move(name):
     graphs = []
 

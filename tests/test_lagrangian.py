@@ -297,7 +297,8 @@ def test_a_delayed_policy_is_updated_in_the_wrapped_loss():
 
 # tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
 @pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
-@pytest.mark.parametrize("parent", [A2CLoss, pytest.param(ReinforceLoss, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("parent", [A2CLoss, ReinforceLoss])
 def test_compiles_to_one_graph_that_sees_the_multiplier_move(parent):
     graphs = []
 

@@ -20,6 +20,7 @@ def finished(tmp_path_factory):
     return config
 
 
+@pytest.mark.slow
 def test_what_it_leaves(finished):
     results = json.loads((finished.out / "results.json").read_text())
     assert {run["cell"] for run in results["runs"]} == set(CELLS)

@@ -149,6 +149,7 @@ def test_state_goes_to_another_loss():
 
 
 @pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.slow
 def test_compiles_to_one_graph():
     loss, data = make_loss(2), estimated(2)
     compiled = torch.compile(loss, fullgraph=True, backend="eager")
