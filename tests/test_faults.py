@@ -157,7 +157,8 @@ def test_training_whose_worker_is_killed(tmp_path):
         os.kill(workers[-1], signal.SIGKILL)
         _, stderr = run.communicate(timeout=60)
     assert run.returncode == 1
-    assert "At least one process failed" in stderr
+    # TorchRL's message, or its own stumbling over a worker that takes its time to end.
+    assert "At least one process failed" in stderr or "Cannot close a process" in stderr
     assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]
 
 
