@@ -111,6 +111,11 @@ def test_boxes_are_as_wide_as_their_diagonal():
     assert quarters.min() > 110
 
 
+def test_a_whole_number_beyond_all_floats_is_refused():
+    with pytest.raises(ValueError, match="gap must be positive and finite, got 1000"):
+        InFront(gap=10**400)
+
+
 @pytest.mark.parametrize(("fewest", "numbers"), [(None, [3]), (3, [3]), (1, [1, 2, 3])])
 def test_scattered_numbers_are_equally_likely(fewest, numbers):
     _, present = scatter(Scattered(3, fewest), 600)

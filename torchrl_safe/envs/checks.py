@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import sys
 from numbers import Real
 from types import UnionType
 from typing import Any, get_args
@@ -11,18 +12,21 @@ import numpy as np
 
 from torchrl_safe.envs.state import Array
 
+# Python's whole numbers go on where floats end.
+_LARGEST = sys.float_info.max
+
 
 def check_positive(**values: float) -> None:
     """Raises ValueError unless each value is a number, positive and finite."""
     for name, value in values.items():
-        if not isinstance(value, Real) or not 0 < value < np.inf:
+        if not isinstance(value, Real) or not 0 < value <= _LARGEST:
             raise ValueError(f"{name} must be positive and finite, got {value!r}.")
 
 
 def check_not_negative(**values: float) -> None:
     """Raises ValueError unless each value is a number, not negative and finite."""
     for name, value in values.items():
-        if not isinstance(value, Real) or not 0 <= value < np.inf:
+        if not isinstance(value, Real) or not 0 <= value <= _LARGEST:
             raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
 
 

@@ -57,14 +57,14 @@ class Human:
     pause: tuple[float, float] = (0.1, 0.8)
 
     def __post_init__(self) -> None:
-        check_array("shoulder", self.shoulder, (3,))
-        check_array("rest", self.rest, (3,))
+        shoulder = check_array("shoulder", self.shoulder, (3,))
+        rest = check_array("rest", self.rest, (3,))
         for name in ("duration", "pause"):
             shortest, longest = check_array(name, getattr(self, name), (2,))
             check_positive(**{name: float(shortest)})
             if shortest > longest:
                 raise ValueError(f"{name} must be shortest, longest, got {shortest}, {longest}.")
-        length = np.linalg.norm(np.subtract(self.rest, self.shoulder))
+        length = np.linalg.norm(rest - shoulder)
         if length > _REACH:
             raise ValueError(
                 f"rest must be within {_REACH} m of the shoulder, got {self.rest}, which is "
