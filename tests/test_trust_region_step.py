@@ -565,6 +565,7 @@ def test_other_bad_losses_are_refused():
         ("max_kl", 0.0),
         ("max_kl", float("nan")),
         ("max_kl", float("inf")),
+        ("max_kl", None),
         ("damping", -0.1),
         ("cg_iterations", 0),
         ("shrink", 1.0),

@@ -124,9 +124,9 @@ class TrustRegionStep:
         max_backtracks: int = 10,
     ) -> None:
         _check_loss(loss_module, method)
-        for name, value in (("max_kl", max_kl), ("episode_length", episode_length)):
-            if value is not None:
-                check_number(name, value, positive=True)
+        check_number("max_kl", max_kl, positive=True)
+        if episode_length is not None:
+            check_number("episode_length", episode_length, positive=True)
         check_number("damping", damping)
         check_count("cg_iterations", cg_iterations)
         for name, value, allowed in (
