@@ -13,6 +13,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from experiments.files import write_whole
+
 _PACKAGES = (
     "torch", "torchrl", "tensordict", "pybullet", "numpy", "panda-gym", "stable-baselines3", "ray",
     # Without it, tensordict looks for it on the disk whenever a module writes a key.
@@ -76,7 +78,7 @@ def record(part: str, figures: Sequence[Figure], out: Path) -> None:
             {**dataclasses.asdict(figure), "verdict": figure.verdict} for figure in figures
         ],
     }
-    file.write_text(json.dumps(results, indent=1))
+    write_whole(file, json.dumps(results, indent=1))
     (out / "table.md").write_text("\n\n".join(_section(*item) for item in results.items()) + "\n")
 
 

@@ -124,7 +124,7 @@ def make_agent(env: EnvBase, *, gamma: float) -> Agent:
 
     actor = make_actor(spec, loc, scale)
     log_std = actor.get_parameter("0.module.1.state_independent_scale")
-    critics = critic(1, "state_value"), critic(_num_costs(env), "cost_value")
+    critics = critic(1, "state_value"), critic(num_costs(env), "cost_value")
     return Agent(actor, *critics, log_std, spec)
 
 
@@ -146,7 +146,7 @@ def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
         predict = _OfStateAndAction(Affine(loc, scale), net, Affine(0.0, 1 / (1 - gamma)))
         return ValueOperator(predict, in_keys=["observation", "action"], out_keys=[out_key])
 
-    costs = _num_costs(env)
+    costs = num_costs(env)
     critics = critic(1, "state_action_value"), critic(costs, "state_action_cost_value")
     return QAgent(actor, *critics, spec)
 
@@ -169,7 +169,8 @@ def _actor_spec(env: EnvBase, *, noise: Literal["same", "chosen", "none"]) -> Ac
     )
 
 
-def _num_costs(env: EnvBase) -> int:
+def num_costs(env: EnvBase) -> int:
+    """How many costs an environment has."""
     return env.reward_spec["cost"].shape[-1]
 
 

@@ -13,7 +13,7 @@ from torchrl.envs import CatTensors, EnvBase, Transform
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, LossModule, ValueEstimators
 
-from experiments.agent import ActorSpec, make_agent, make_q_agent
+from experiments.agent import ActorSpec, make_agent, make_q_agent, num_costs
 from experiments.learners import Learner, NoiseSchedule, OnPolicyLearner, ReplayLearner
 from torchrl_safe.envs import EarlyTermination, Saute
 from torchrl_safe.objectives import (
@@ -130,7 +130,7 @@ class OnPolicy:
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
         agent = make_agent(env, gamma=config.gamma)
-        loss = self.loss(agent.actor, agent.critic, agent.cost_critic, num_costs=_num_costs(env))
+        loss = self.loss(agent.actor, agent.critic, agent.cost_critic, num_costs=num_costs(env))
         discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
         loss.make_value_estimator(ValueEstimators.GAE, **discount)
         loss.make_cost_value_estimator(**discount)
@@ -179,7 +179,7 @@ class OffPolicy:
             agent.actor,
             agent.critic,
             agent.cost_critic,
-            num_costs=_num_costs(env),
+            num_costs=num_costs(env),
             action_spec=spec,
         )
         loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
@@ -251,10 +251,6 @@ ALGORITHMS: dict[str, Algorithm] = {
     "sac-lagrangian": OffPolicy(SACLagrangianLoss, stochastic=True),
     "td3-lagrangian": OffPolicy(TD3LagrangianLoss, stochastic=False),
 }
-
-
-def _num_costs(env: EnvBase) -> int:
-    return env.reward_spec["cost"].shape[-1]
 
 
 def _start_multiplier(loss: LossModule, updater: Any, config: Config) -> None:

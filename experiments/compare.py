@@ -18,7 +18,8 @@ import tyro
 
 from experiments import train
 from experiments.grid import run_grid, save_results
-from torchrl_safe.metrics import mean, worst_seed
+from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
+from torchrl_safe.metrics import worst_seed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,15 +73,12 @@ def table(runs: list[dict[str, Any]], cost_limit: float) -> str:
     ]
     for algorithm in dict.fromkeys(run["algorithm"] for run in runs):
         mine = [run for run in runs if run["algorithm"] == algorithm]
-        costs = torch.tensor([run["episodes"]["episode_cost"] for run in mine]).squeeze(-1)
-        middle = mean(costs.unsqueeze(-1), resample="seeds" if len(mine) > 1 else "episodes")
-        success = [run["evaluation"]["success"][0] for run in mine]
+        costs, success = episode_costs(mine), successes(mine)
         returns = [run["evaluation"]["return"][0] for run in mine]
         lines.append(
-            f"| {algorithm} "
-            f"| {middle.value.item():.2f} [{middle.low.item():.2f}, {middle.high.item():.2f}] "
+            f"| {algorithm} | {mean_over_seeds(costs)} "
             f"| {worst_seed(costs.unsqueeze(-1)).value.item():.2f} "
-            f"| {(costs.mean(1) <= cost_limit).sum()}/{len(mine)} "
+            f"| {seeds_within(costs, cost_limit)} "
             f"| {sum(success) / len(mine):.1%} | {min(success):.1%} "
             f"| {sum(returns) / len(mine):.2f} "
             f"| {sum(run['seconds'] for run in mine) / len(mine) / 60:.1f} |"

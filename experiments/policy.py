@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from experiments.agent import ActorSpec, make_actor
+from experiments.files import writing
 
 #: What a file of ours says it is; the number rises when its contents change.
 _FORMAT, _VERSION = "torchrl-safe policy", 1
@@ -51,15 +51,8 @@ def save_policy(
         "weights": actor.state_dict(),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".tmp")
-    try:
-        with unfinished.open("wb") as file:
-            torch.save(contents, file)
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with writing(path) as file:
+        torch.save(contents, file)
 
 
 def load_policy(path: Path) -> SavedPolicy:

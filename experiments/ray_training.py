@@ -33,6 +33,7 @@ from tqdm import tqdm
 
 from experiments import train
 from experiments.algorithms import ALGORITHMS
+from experiments.files import is_new
 from experiments.log import Log, figures
 from torchrl_safe.envs import ArmEnv, Collision, Speed
 from torchrl_safe.objectives import DualAscent
@@ -145,6 +146,8 @@ class Collection:
 
 def main(config: Config) -> dict[str, Any]:
     """Trains; returns the last figures and how often actors were replaced."""
+    if not is_new(config.out):
+        raise FileExistsError(f"out must be a new or empty folder, got {str(config.out)!r}.")
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
@@ -161,8 +164,6 @@ def main(config: Config) -> dict[str, Any]:
         pessimism=settings.pessimism,
         normalize=True,
     )
-    if config.out.exists() and any(config.out.iterdir()):
-        raise FileExistsError(f"out must be a new or empty folder, got {str(config.out)!r}.")
     log = Log("csv", config.out / "logs", "ppo-lagrangian")
     log.open()
     batches = math.ceil(config.frames / config.frames_per_batch)

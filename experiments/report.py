@@ -13,6 +13,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_safe.metrics import mean
+
 COLOURS = ("tab:orange", "tab:blue", "tab:green", "tab:purple")
 
 
@@ -34,6 +36,27 @@ def figures_table(rows: dict[str, dict[str, list[float]]], cost_limit: float) ->
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     lines.append(f"\nCost limit {cost_limit:g}; brackets: 95 % confidence.")
     return "\n".join(lines)
+
+
+def episode_costs(runs: list[dict[str, Any]]) -> torch.Tensor:
+    """Costs of the evaluated episodes of some runs, shape (seeds, episodes)."""
+    return torch.tensor([run["episodes"]["episode_cost"] for run in runs]).squeeze(-1)
+
+
+def successes(runs: list[dict[str, Any]]) -> list[float]:
+    """Share of the evaluated episodes that reach the target, for each run."""
+    return [run["evaluation"]["success"][0] for run in runs]
+
+
+def mean_over_seeds(costs: torch.Tensor) -> str:
+    """Mean of (seeds, episodes) with its 95 % interval over seeds; of one seed, over episodes."""
+    middle = mean(costs.unsqueeze(-1), resample="seeds" if len(costs) > 1 else "episodes")
+    return f"{middle.value.item():.2f} [{middle.low.item():.2f}, {middle.high.item():.2f}]"
+
+
+def seeds_within(costs: torch.Tensor, limit: float) -> str:
+    """How many seeds of (seeds, episodes) keep a limit on average, of how many."""
+    return f"{(costs.mean(1) <= limit).sum()}/{len(costs)}"
 
 
 def plot_curves(results: dict[str, Any], path: Path) -> None:

@@ -19,7 +19,7 @@ import tyro
 
 from experiments import train
 from experiments.grid import run_grid, save_results
-from experiments.report import COLOURS
+from experiments.report import COLOURS, episode_costs, mean_over_seeds, seeds_within, successes
 from torchrl_safe.metrics import mean, worst_seed
 
 # Where a cost of 0 is drawn on a logarithmic axis.
@@ -77,16 +77,6 @@ def names(config: Config) -> Iterable[tuple[int, train.Action, float | None]]:
     return product(range(config.seeds), config.actions, (*config.limits, None))
 
 
-def episode_costs(runs: list[dict[str, Any]]) -> torch.Tensor:
-    """Costs of the evaluated episodes, shape (seeds, episodes)."""
-    return torch.tensor([run["episodes"]["episode_cost"] for run in runs]).squeeze(-1)
-
-
-def successes(runs: list[dict[str, Any]]) -> list[float]:
-    """Share of the evaluated episodes that reach the target, for each seed."""
-    return [run["evaluation"]["success"][0] for run in runs]
-
-
 def table(runs: list[dict[str, Any]], config: Config) -> str:
     """Returns a Markdown table with a row for each action and limit."""
     lines = [
@@ -97,15 +87,13 @@ def table(runs: list[dict[str, Any]], config: Config) -> str:
     for action, limit in product(config.actions, (*config.limits, None)):
         mine = _select(runs, action, limit)
         costs = episode_costs(mine)
-        kept = "" if limit is None else f"{(costs.mean(1) <= limit).sum()}/{len(mine)}"
-        middle = mean(costs.unsqueeze(-1), resample="seeds" if len(mine) > 1 else "episodes")
+        kept = "" if limit is None else seeds_within(costs, limit)
         returns = torch.tensor([run["evaluation"]["return"][0] for run in mine])
         multipliers = [run["history"][-1]["multiplier/collision"] for run in mine]
         success = successes(mine)
         lines.append(
             f"| {action} | {'none (PPO)' if limit is None else f'{limit:g}'} | {kept} "
-            f"| {worst_seed(costs.unsqueeze(-1)).value.item():.2f} "
-            f"| {middle.value.item():.2f} [{middle.low.item():.2f}, {middle.high.item():.2f}] "
+            f"| {worst_seed(costs.unsqueeze(-1)).value.item():.2f} | {mean_over_seeds(costs)} "
             f"| {sum(success) / len(success):.1%} | {min(success):.1%} | {returns.mean():.2f} "
             f"| {min(multipliers):.2f} to {max(multipliers):.2f} |"
         )

@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, OffPolicy
 from experiments.evaluation import evaluate, summarize
-from experiments.files import UNFINISHED, write_whole
+from experiments.files import is_new, write_whole
 from experiments.log import Log, figures, score
 from experiments.policy import save_policy
 from experiments.report import plot_curves, save_animation, save_picture, table
@@ -349,7 +349,7 @@ def start(config: Config) -> dict[str, Any]:
         before = json.loads(path.read_text())
         refuse_other_settings(settings(before["config"]), settings(results["config"]))
         results["algorithms"] = before["algorithms"]
-    elif config.out.exists() and any(file.suffix != UNFINISHED for file in config.out.iterdir()):
+    elif not is_new(config.out):
         raise FileExistsError(
             f"out must be a new or empty folder, or with resume that of a run, got "
             f"{str(config.out)!r}."
