@@ -64,6 +64,11 @@ def state_of(world):
     )
 
 
+def test_a_number_of_any_kind_is_one():
+    """NumPy's short floats overflow if they are compared with the largest of all floats."""
+    assert CartesianDelta(step=np.float32(0.5)).step == 0.5
+
+
 def test_one_step_of_least_squares_lands_near_the_target():
     world = World(PANDA, Scene(), ())
     check = World(PANDA, Scene(), ())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import operator
-import sys
 from numbers import Real
 from types import UnionType
 from typing import Any, get_args
@@ -12,21 +12,18 @@ import numpy as np
 
 from torchrl_safe.envs.state import Array
 
-# Python's whole numbers go on where floats end.
-_LARGEST = sys.float_info.max
-
 
 def check_positive(**values: float) -> None:
     """Raises ValueError unless each value is a number, positive and finite."""
     for name, value in values.items():
-        if not isinstance(value, Real) or not 0 < value <= _LARGEST:
+        if not _is_finite(value) or value <= 0:
             raise ValueError(f"{name} must be positive and finite, got {value!r}.")
 
 
 def check_not_negative(**values: float) -> None:
     """Raises ValueError unless each value is a number, not negative and finite."""
     for name, value in values.items():
-        if not isinstance(value, Real) or not 0 <= value <= _LARGEST:
+        if not _is_finite(value) or value < 0:
             raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
 
 
@@ -63,3 +60,10 @@ def check_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite, got {array}.")
     return array
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return isinstance(value, Real) and math.isfinite(value)
+    except OverflowError:  # Python's whole numbers go on where floats end.
+        return False
