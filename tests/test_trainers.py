@@ -1,6 +1,7 @@
 """The multiplier inside TorchRL's trainers: the hook, the PPO trainer, and what they save."""
 
 import csv
+from functools import partial
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.checkpoint import Checkpoint
-from torchrl.collectors import Collector
+from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
@@ -341,6 +342,56 @@ def assert_same_state(loss, expected):
     assert state.keys() == expected.keys()
     for key, value in expected.items():
         assert torch.equal(torch.as_tensor(state[key]), torch.as_tensor(value)), key
+
+
+def make_world(seed):
+    arm = ArmEnv(num_envs=2, costs={"always": always}, max_episode_steps=STEPS, seed=seed)
+    return TransformedEnv(arm, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
+
+
+@pytest.mark.slow
+def test_worker_processes():
+    """Their episodes move the multiplier, and each batch is of the policy as it has become."""
+    torch.manual_seed(0)
+    actor = make_actor(40)
+    critic = ValueOperator(MLP(40, 1, num_cells=[8]), ["observation"])
+    cost_critic = ValueOperator(MLP(40, 1, num_cells=[8]), ["observation"], ["cost_value"])
+    loss = PPOLagrangianLoss(actor, critic, cost_critic, entropy_bonus=False)
+    collector = MultiSyncCollector(
+        [partial(make_world, seed) for seed in range(2)],
+        actor,
+        frames_per_batch=FRAMES,
+        total_frames=3 * FRAMES,
+        auto_register_policy_transforms=False,
+    )
+    trainer = PPOLagrangianTrainer(
+        collector=collector,
+        total_frames=3 * FRAMES,
+        loss_module=loss,
+        updater=DualAscent(loss, cost_limit=2.0, lr=0.1),
+        optimizer=torch.optim.Adam(loss.parameters(), lr=1e-2),
+        replay_buffer=make_buffer(FRAMES, FRAMES // 2),
+        weight_update_map={"policy": "loss_module.actor_network"},
+        progress_bar=False,
+    )
+    lags, policies = [], []
+
+    def compare(batch):
+        """The workers' log-probabilities against those of the loss's policy."""
+        policies.append(loss.actor_network_params.data.clone())
+        with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
+            log_prob = loss.actor_network.get_dist(batch).log_prob(batch["action"])
+        lags.append((log_prob - batch["action_log_prob"]).abs().max())
+        return batch
+
+    trainer.register_op("batch_process", compare)
+    try:
+        trainer.train()
+    finally:
+        collector.shutdown()
+    assert loss.lagrange_multiplier.item() == pytest.approx(0.9)
+    assert max(lags) < 1e-4
+    assert not (policies[0] == policies[2]).all()
 
 
 def test_discounts(make_arm):
