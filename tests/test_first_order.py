@@ -551,6 +551,7 @@ def test_compiles_to_one_graph_that_sees_the_costs_move(name):
         (P3OLoss, "penalty_coeff", 0.0),
         (P3OLoss, "reduction", "none"),
         (IPOLoss, "sharpness", float("nan")),
+        (IPOLoss, "sharpness", 1e-40),
         (IPOLoss, "reduction", "sum"),
         (crpo, "tolerance", -0.5),
         (FOCOPSLoss, "num_costs", 0),

@@ -345,6 +345,14 @@ def test_a_loss_that_would_normalize_the_mixture_is_refused(parent, argument):
         wrap(parent)
 
 
+def test_an_option_that_is_neither_true_nor_false_is_refused():
+    """A tensor would be asked for its truth, which it has not."""
+    actor, critic, cost_critic = make_networks()
+    wrapped = ClipPPOLoss(actor, critic, entropy_bonus=False)
+    with pytest.raises(TypeError, match=r"separate_losses must be a bool, got tensor"):
+        LagrangianLoss(wrapped, cost_critic, separate_losses=torch.zeros(3))
+
+
 def test_costs_that_do_not_fit_are_refused():
     actor, critic, cost_critic = make_networks(3)
     with pytest.raises(ValueError, match="num_costs must be a whole number of at least 1, got 0"):

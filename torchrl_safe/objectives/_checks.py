@@ -10,6 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+# Losses compute in single precision, and divide by what must be positive.
+_LARGEST = torch.finfo(torch.float32).max
+_SMALLEST = 1e-30
+
 
 def check_count(name: str, value: Any) -> None:
     """Raises ValueError unless the value is a whole number of at least 1."""
@@ -27,8 +31,7 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
     A float, whatever came: a buffer made of a whole number would hold whole numbers for ever.
     """
     number = as_number(value)
-    # Finite in single precision, in which losses compute.
-    if not (number > 0 if positive else number >= 0) or number > torch.finfo(torch.float32).max:
+    if not (_SMALLEST if positive else 0) <= number <= _LARGEST:
         kind = "positive" if positive else "not negative"
         raise ValueError(f"{name} must be finite and {kind}, got {value!r}.")
     return number

@@ -37,6 +37,8 @@ class WrappedLoss(LossModule):
 
     def __init__(self, loss_module: LossModule, *, separate_losses: bool = False) -> None:
         _check_wrapped(loss_module)
+        if not isinstance(separate_losses, bool):
+            raise TypeError(f"separate_losses must be a bool, got {separate_losses!r}.")
         super().__init__()
         self._in_keys: list[NestedKey] = []
         self.loss_module = loss_module

@@ -96,6 +96,7 @@ class CRPOLoss(ViolationMixin, WrappedLoss):
             policy out of the cost critic's loss. Defaults to ``False``.
 
     Raises:
+        TypeError: if ``separate_losses`` is not a bool.
         ValueError: if ``loss_module`` reads no advantage or normalizes the one it is given, or
             ``num_costs`` or ``tolerance`` is not usable; in a call, if the cost critic or the
             costs have another width than ``num_costs``.
