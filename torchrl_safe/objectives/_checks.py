@@ -10,15 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# Losses compute in single precision, and divide by what must be positive.
+# Losses compute in single precision, also with squares of what is positive, and divide by them.
 _LARGEST = torch.finfo(torch.float32).max
-_SMALLEST = 1e-30
+_SMALLEST, _LARGE = 1e-18, 1e18
 
 
 def check_count(name: str, value: Any) -> None:
     """Raises ValueError unless the value is a whole number of at least 1."""
     try:
-        usable = not isinstance(value, bool) and operator.index(value) >= 1
+        usable = not isinstance(value, bool) and 1 <= operator.index(value) < 2**31
     except TypeError:
         usable = False
     if not usable:
@@ -31,9 +31,10 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
     A float, whatever came: a buffer made of a whole number would hold whole numbers for ever.
     """
     number = as_number(value)
-    if not (_SMALLEST if positive else 0) <= number <= _LARGEST:
-        kind = "positive" if positive else "not negative"
-        raise ValueError(f"{name} must be finite and {kind}, got {value!r}.")
+    if positive and not _SMALLEST <= number <= _LARGE:
+        raise ValueError(f"{name} must be positive, from 1e-18 to 1e18, got {value!r}.")
+    if not 0 <= number <= _LARGEST:
+        raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
     return number
 
 
