@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import math
+import sys
 
 import numpy as np
 import pybullet
@@ -90,6 +91,14 @@ def test_forgotten_world_is_closed():
     assert open_clients() != before
     del world
     assert open_clients() == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a window needs no DISPLAY")
+def test_a_window_without_a_screen_is_refused(monkeypatch):
+    """PyBullet itself would end the process."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(RuntimeError, match="gui needs a screen"):
+        ArmEnv(gui=True)
 
 
 def test_failed_environment_is_closed():

@@ -85,7 +85,7 @@ class ArmEnv(EnvBase):
         TypeError: if an argument is not of its kind.
         ValueError: if an argument is not usable, an action, observation, reward or cost is not
             finite or has the wrong shape, or the obstacles overlap the arm at home.
-        RuntimeError: if the environment is closed.
+        RuntimeError: if the environment is closed, or ``gui`` is wanted and there is no screen.
 
     Examples:
         >>> env = ArmEnv(num_envs=2, seed=0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 import weakref
 from collections.abc import Sequence
 from typing import NoReturn
@@ -59,6 +61,9 @@ class World:
         visuals: bool = False,
         gui: bool = False,
     ) -> None:
+        if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+            # PyBullet would end the process, and with it all that was learnt.
+            raise RuntimeError("gui needs a screen, but DISPLAY is not set: make a video instead.")
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError(
