@@ -57,6 +57,13 @@ def test_equals_the_recursion(num_costs, vectorized):
     torch.testing.assert_close(batch["cost_value_target"], expected + batch["cost_value"])
 
 
+@pytest.mark.parametrize(("gamma", "lmbda"), [(0.9, 0.0), (0.0, 0.7), (1.0, 1.0)])
+def test_limits_of_the_discounts(gamma, lmbda):
+    batch = with_values(2)
+    make_gae(gamma=gamma, lmbda=lmbda, average_gae=False)(batch)
+    torch.testing.assert_close(batch["cost_advantage"], recursion(batch, gamma, lmbda))
+
+
 def test_one_row_by_hand():
     # gamma = lmbda = 0.5, so the trace decays by 0.25; step 0 is truncated, step 2 terminates:
     #   step 2: delta = 4 - 1               = 3       A = 3

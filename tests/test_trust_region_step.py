@@ -571,6 +571,7 @@ def test_other_bad_losses_are_refused():
         ("shrink", 1.0),
         ("shrink", 0.0),
         ("max_backtracks", -1),
+        ("max_backtracks", 2.5),
         ("episode_length", 0),
         ("episode_length", float("inf")),
     ],

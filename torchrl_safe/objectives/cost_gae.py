@@ -32,7 +32,8 @@ class CostGAE(GAE):
         value_network (TensorDictModule, optional): cost critic with k outputs. ``None`` expects
             ``"cost_value"`` and ``("next", "cost_value")`` in the data.
         average_gae (bool, optional): centre the advantages. Defaults to ``True``.
-        vectorized (bool, optional): use the vectorized recursion. Defaults to ``True``.
+        vectorized (bool, optional): use the vectorized recursion, unless ``gamma`` or ``lmbda``
+            is 0, for which TorchRL's fails. Defaults to ``True``.
         **kwargs: the other arguments of :class:`~torchrl.objectives.value.GAE`, ``group_key``
             excepted.
 
@@ -92,7 +93,7 @@ class CostGAE(GAE):
             lmbda=lmbda,
             value_network=value_network,
             average_gae=average_gae,
-            vectorized=vectorized,
+            vectorized=vectorized and bool(gamma * lmbda),
             **kwargs,
         )
 

@@ -131,7 +131,11 @@ class TrustRegionStep:
         check_count("cg_iterations", cg_iterations)
         for name, value, allowed in (
             ("shrink", shrink, 0 < as_number(shrink) < 1),
-            ("max_backtracks", max_backtracks, as_number(max_backtracks) >= 0),
+            (
+                "max_backtracks",
+                max_backtracks,
+                isinstance(max_backtracks, int) and max_backtracks >= 0,
+            ),
         ):
             if not allowed:
                 raise ValueError(f"{name} is out of its range, got {value!r}.")
