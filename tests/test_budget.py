@@ -192,6 +192,17 @@ def test_only_more_than_the_budget_ends_an_episode(budget, steps):
     ).all()
 
 
+def test_a_budget_that_is_just_used_up_ends_no_episode_by_rounding():
+    """Ten times 0.1 is more than 1 in single precision."""
+    ending = EarlyTermination(1.0)
+    tally = torch.zeros(1, 1)
+    for _ in range(10):
+        tally = ending.advance(tally, torch.full((1, 1), 0.1))
+    assert tally > 1
+    assert not ending.is_spent(tally)
+    assert ending.is_spent(ending.advance(tally, torch.full((1, 1), 1e-3)))
+
+
 def test_one_cost_of_several_ends_an_episode():
     budget = torch.tensor([99.0, 100.5, 1e4])
     env = inside(partial(EarlyTermination, budget), 2, num_costs=3)

@@ -98,7 +98,7 @@ def test_the_cost_surrogate_takes_the_larger_product():
     log_weight = torch.tensor([[2.0], [0.5], [1.1]]).log()
     cost_advantage = torch.tensor([[1.0, -1.0], [1.0, -1.0], [3.0, -3.0]])
     surrogate = clipped_cost_surrogate(log_weight, cost_advantage, bounds)
-    expected = torch.tensor([[2.0, -1.2], [0.8, -0.5], [3.3, -3.3]])
+    expected = torch.tensor([[2.0, -1.2], [0.8, -0.5], [3.3, -3.3]]) - cost_advantage
     torch.testing.assert_close(surrogate, expected)
     weighted = clipped_cost_surrogate(log_weight, cost_advantage, bounds, math.log(2.0))
     torch.testing.assert_close(weighted, 2 * expected)
@@ -283,6 +283,29 @@ def test_ipo_by_hand():
     penalty = loss(data)["loss_penalty"]
     torch.testing.assert_close(penalty, expected)
     torch.testing.assert_close(actor_gradient(loss, penalty), actor_gradient(loss, expected))
+
+
+@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss])
+def test_the_penalty_of_an_unmoved_policy_is_that_of_the_limit_in_every_minibatch(kind):
+    """Costs are at random more or less in a minibatch: the policy has not changed by that."""
+    loss = build(kind, 2)
+    data = estimated(loss, 2)
+    with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
+        dist = loss.actor_network.get_dist(data)
+    data["action_log_prob"] = dist.log_prob(data["action"])
+    step(loss, [-0.1, -0.5])
+    expected = loss(data)["loss_penalty"]
+    parts = data.split(4)
+    assert min(part["cost_advantage"].mean(0).abs().max() for part in parts) > 0.01
+    for part in parts:
+        torch.testing.assert_close(loss(part)["loss_penalty"], expected)
+
+
+@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss, CUPLoss])
+def test_costs_without_discount_are_refused(kind):
+    """1 / (1 - gamma) is how many steps an episode is taken to have."""
+    with pytest.raises(ValueError, match=r"gamma of the costs must be below 1, got 1\.0"):
+        build(kind).make_cost_value_estimator(gamma=1.0)
 
 
 @pytest.mark.parametrize("violation", [[0.5, 2.0, -1.0], [2.0, 0.5, -1.0], [0.5, 0.75, -1.0]])
@@ -589,10 +612,27 @@ def test_a_cost_critic_of_the_wrong_width_is_refused(make):
 @pytest.mark.parametrize("num_costs", [1, 2])
 def test_a_loss_of_the_wrong_width_is_refused(make, num_costs):
     actor, critic, cost_critic = make_networks(3)
+    data = estimated(make(actor, critic, cost_critic, num_costs=3), 3)
     loss = make(actor, critic, cost_critic, num_costs=num_costs)
-    data = estimated(loss, 3)
-    with pytest.raises(ValueError, match=r"cost_advantage .*\(24, 3\)"):
+    with pytest.raises(ValueError, match=r"'cost'.* each of the . costs of num_costs"):
+        loss.estimate_advantages(make_batch(3))
+    with pytest.raises(ValueError, match=r"cost_advantage.*\(24, 3\)"):
         (loss.projection_loss if make is CUPLoss else loss)(data)
+
+
+@pytest.mark.parametrize("make", [FOCOPSLoss, CUPLoss])
+def test_the_divergence_that_is_reported_is_that_of_the_steps_that_count(make):
+    loss = build(make)
+    data = estimated(loss)
+    if make is CUPLoss:
+        loss.start_projection()
+        train(loss, data, 3)
+    kept = torch.arange(len(data)) % 3 > 0
+    evaluate = loss.projection_loss if make is CUPLoss else loss
+    expected = evaluate(data[kept])["kl"]
+    data["collector", "mask"] = kept.unsqueeze(-1)
+    assert expected > 1e-4
+    torch.testing.assert_close(evaluate(data)["kl"], expected)
 
 
 def test_what_only_one_of_them_needs_is_named_when_missing():
@@ -602,11 +642,9 @@ def test_what_only_one_of_them_needs_is_named_when_missing():
     loss = build(CUPLoss)
     with pytest.raises(KeyError, match="'cost_advantage'"):
         loss.projection_loss(make_batch().reshape(-1))
-    data = estimated(loss)
     estimator = TD0Estimator(gamma=0.9, value_network=loss.cost_critic_network)
-    loss.make_cost_value_estimator(estimator)
-    with pytest.raises(ValueError, match=r"trace decay.*must be a GAE, got TD0Estimator"):
-        loss.projection_loss(data)
+    with pytest.raises(ValueError, match=r"estimator must be a GAE, .* got TD0Estimator"):
+        loss.make_cost_value_estimator(estimator)
 
 
 def test_crpo_wraps_any_advantage_loss():

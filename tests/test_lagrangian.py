@@ -16,7 +16,7 @@ from tensordict.nn import (
 from tensordict.utils import unravel_key
 from torch import nn
 from torch.distributions.transforms import SoftplusTransform
-from torchrl.modules import IndependentNormal, PopArtValueNorm, ValueOperator
+from torchrl.modules import IndependentNormal, PopArtValueNorm, ValueOperator, recurrent_mode
 from torchrl.objectives import (
     A2CLoss,
     ClipPPOLoss,
@@ -345,6 +345,36 @@ def test_a_loss_that_would_normalize_the_mixture_is_refused(parent, argument):
         wrap(parent)
 
 
+def test_the_entry_that_masks_is_that_of_the_wrapped_loss():
+    loss = wrap(PARENTS["clip-ppo"], 2)
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    kept = torch.arange(len(data)) % 3 > 0
+    expected = loss(data[kept])
+    data["mine"] = kept
+    loss.loss_mask_key = "mine"
+    losses = loss(data)
+    for key in ("loss_objective", "loss_critic", "loss_cost_critic"):
+        torch.testing.assert_close(losses[key], expected[key])
+
+
+def test_recurrent_critics_see_whole_sequences_in_both_ways():
+    """As they do in a call of the loss, around which TorchRL says so."""
+    modes = []
+
+    class Critic(nn.Linear):
+        def forward(self, observation):
+            modes.append(recurrent_mode())
+            return super().forward(observation)
+
+    actor, critic, _ = make_networks()
+    cost_critic = ValueOperator(Critic(OBSERVATION, 1), out_keys=["cost_value"])
+    loss = LagrangianLoss(ClipPPOLoss(actor, critic, entropy_bonus=False), cost_critic)
+    loss.estimate_advantages(make_batch())
+    loss(make_batch())
+    assert modes
+    assert all(modes)
+
+
 def test_an_option_that_is_neither_true_nor_false_is_refused():
     """A tensor would be asked for its truth, which it has not."""
     actor, critic, cost_critic = make_networks()
@@ -360,7 +390,7 @@ def test_costs_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"multiplier_init.* 2 costs.*\(3,\)"):
         wrap(A2CLoss, 2, multiplier_init=torch.ones(3))
     loss = LagrangianLoss(A2CLoss(actor, critic), cost_critic, num_costs=2)
-    with pytest.raises(ValueError, match=r"\(24, 3\) and lagrange_multiplier of shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"'cost'.* one column for each of the 2 costs.*\(4, 6, 3\)"):
         loss(loss.estimate_advantages(make_batch(3)).reshape(-1))
     for call in (loss, loss.estimate_advantages):
         with pytest.raises(KeyError, match=r"\('next', 'cost'\)"):

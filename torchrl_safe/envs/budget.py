@@ -10,6 +10,9 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+# In units of the budget: one that is used up to the last digit is not exceeded by rounding.
+ROUNDING = 1e-5
+
 
 class CostTally(Transform, abc.ABC):
     """Keeps one number for each of k costs from step to step, as an observation of its own.

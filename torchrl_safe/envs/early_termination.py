@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite
 
-from torchrl_safe.envs.budget import CostTally
+from torchrl_safe.envs.budget import ROUNDING, CostTally
 from torchrl_safe.envs.checks import check_array
 
 
@@ -91,7 +91,7 @@ class EarlyTermination(CostTally):
         return tally + cost
 
     def is_spent(self, tally: Tensor) -> Tensor:
-        return tally > self.budget.to(tally)
+        return tally > (1 + ROUNDING) * self.budget.to(tally)
 
     def enforce(self, next_tensordict: TensorDictBase, spent: Tensor) -> TensorDictBase:
         reward = next_tensordict.get(self.reward_key)

@@ -8,11 +8,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torchrl_safe.envs.budget import CostTally
+from torchrl_safe.envs.budget import ROUNDING, CostTally
 from torchrl_safe.envs.checks import check_array
-
-# In units of the budget: a budget that is used up to the last digit is not exceeded by rounding.
-_ROUNDING = 1e-5
 
 
 class Saute(CostTally):
@@ -28,8 +25,8 @@ class Saute(CostTally):
     which stays at or above 0 just if the discounted cost stays at or below d. In each step
     that leaves it below 0 for any of the k costs, the reward is ``unsafe_reward``. Any algorithm
     without constraints then learns to keep to the budget in every episode, not in the mean of
-    episodes alone. The authors' code counts a budget that is exactly used up as exceeded; here,
-    as in their paper, it is not.
+    episodes alone. The authors' code counts a budget that is exactly used up as exceeded; here it
+    is not.
 
     The policy has to see the safety state: join it to its observation with
     :class:`~torchrl.envs.CatTensors`, ``del_keys=False``, as below. Costs, termination and
@@ -45,8 +42,8 @@ class Saute(CostTally):
             It must be below what a step can earn otherwise, or exceeding the budget pays.
         discount (float, optional): :math:`\gamma_c`, above 0 and at most 1. Defaults to ``1.0``:
             the budget is then a limit of the undiscounted episode cost, like ``cost_limit`` of
-            :class:`~torchrl_safe.objectives.MultiplierUpdater`. (The paper turns a limit D on T
-            steps into the budget :math:`D (1 - \gamma_c^T) / (T (1 - \gamma_c))`.)
+            :class:`~torchrl_safe.objectives.MultiplierUpdater`. (The authors' code turns a limit D
+            on T steps into the budget :math:`D (1 - \gamma_c^T) / (T (1 - \gamma_c))`.)
         cost_key (NestedKey, optional): the costs, among the rewards, shape ``(*batch, k)``.
             Defaults to ``"cost"``.
         reward_key (NestedKey, optional): the reward that is replaced. Defaults to ``"reward"``.
@@ -102,7 +99,7 @@ class Saute(CostTally):
         return (tally - cost / self.budget.to(cost)) / self.discount
 
     def is_spent(self, tally: Tensor) -> Tensor:
-        return tally < -_ROUNDING
+        return tally < -ROUNDING
 
     def enforce(self, next_tensordict: TensorDictBase, spent: Tensor) -> TensorDictBase:
         reward = next_tensordict.get(self.reward_key)

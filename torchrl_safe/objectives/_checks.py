@@ -38,6 +38,12 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
     return number
 
 
+def check_discount(gamma: Tensor) -> None:
+    """Raises ValueError unless an episode has 1 / (1 - gamma) steps, a finite number."""
+    if not gamma < 1:
+        raise ValueError(f"gamma of the costs must be below 1, got {gamma.item()}.")
+
+
 def as_number(value: Any) -> float:
     """The value of a number or of a tensor with one element, NaN of anything else."""
     if isinstance(value, Tensor):

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _clip_value_loss, _get_default_device, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
@@ -111,9 +112,13 @@ class CostCriticMixin(LossModule):
                 f"Pass an estimator or hyperparameters, not both: got {estimator} and "
                 f"{sorted(hyperparams)}."
             )
+        self._check_cost_value_estimator(estimator)
         self._cost_value_estimator = estimator
         self._forward_value_estimator_keys()
         return self
+
+    def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
+        """Raises ValueError if the loss cannot use it; any that handles k columns will do."""
 
     @property
     def cost_value_estimator(self) -> ValueEstimatorBase:
@@ -139,12 +144,13 @@ class CostCriticMixin(LossModule):
         Raises:
             KeyError: if the batch has no cost.
         """
-        self._estimate_advantage(tensordict)
-        advantage = tensordict.get(self.tensor_keys.advantage)
-        if advantage.numel() > 1:
-            advantage = self._standardize_advantage(advantage, tensordict)
-        tensordict.set(self.tensor_keys.advantage, advantage)
-        return self._estimate_cost_advantage(tensordict)
+        with set_recurrent_mode(True):  # As TorchRL has it around a loss.
+            self._estimate_advantage(tensordict)
+            advantage = tensordict.get(self.tensor_keys.advantage)
+            if advantage.numel() > 1:
+                advantage = self._standardize_advantage(advantage, tensordict)
+            tensordict.set(self.tensor_keys.advantage, advantage)
+            return self._estimate_cost_advantage(tensordict)
 
     def _estimate_advantage(self, tensordict: TensorDictBase) -> None:
         self.value_estimator(
@@ -154,12 +160,20 @@ class CostCriticMixin(LossModule):
         )
 
     def _estimate_cost_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
-        get_or_raise(tensordict, unravel_key(("next", self.tensor_keys.cost)))
+        key = unravel_key(("next", self.tensor_keys.cost))
+        self._check_width(key, get_or_raise(tensordict, key))
         return self.cost_value_estimator(
             tensordict,
             params=self.cost_critic_network_params.detach() if self.functional else None,
             target_params=self.target_cost_critic_network_params,
         )
+
+    def _check_width(self, key: NestedKey, values: Tensor) -> None:
+        if values.shape[-1] != self.num_costs:
+            raise ValueError(
+                f"{key!r} must have one column for each of the {self.num_costs} costs of "
+                f"num_costs, got shape {tuple(values.shape)}."
+            )
 
     def loss_cost_critic(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor | None, Tensor]:
         """Loss of the cost critic, summed over the costs.
@@ -176,11 +190,7 @@ class CostCriticMixin(LossModule):
             tensordict = tensordict.detach()
         key = self.tensor_keys.cost_value_target
         target = get_or_raise(tensordict, key)
-        if target.shape[-1] != self.num_costs:
-            raise ValueError(
-                f"{key!r} must have one column for each of the {self.num_costs} costs of "
-                f"num_costs, got shape {tuple(target.shape)}."
-            )
+        self._check_width(key, target)
         old_value = None
         if self.clip_value:
             old_value = get_or_raise(tensordict, self.tensor_keys.cost_value)

@@ -9,7 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe.objectives._checks import check_discount
 from torchrl_safe.objectives.violation import ViolationMixin
 
 
@@ -19,10 +21,14 @@ def clipped_cost_surrogate(
     bounds: tuple[Tensor, Tensor],
     log_is_weight: Tensor | float = 0.0,
 ) -> Tensor:
-    r"""PPO's surrogate with the sign of a cost: the larger of the two products counts.
+    r"""PPO's surrogate with the sign of a cost, the larger of two products, from where it starts.
 
     .. math::
-        \max(r A_c,\ \mathrm{clip}(r) A_c)
+        \max(r A_c,\ \mathrm{clip}(r) A_c) - A_c
+
+    The last term has mean zero over the batch that was collected, not over a minibatch. Left in,
+    the noise of its mean there would be taken for a change of the policy, and a convex penalty
+    makes that a bias.
 
     Args:
         log_weight (Tensor): logarithm of the ratio r that is clipped, shape ``(*B, 1)``.
@@ -34,9 +40,9 @@ def clipped_cost_surrogate(
     Returns:
         The surrogate of each sample and cost, shape ``(*B, k)``.
     """
-    ratio = (log_weight + log_is_weight).exp()
-    clipped = (log_weight.clamp(*bounds) + log_is_weight).exp()
-    return torch.maximum(ratio * cost_advantage, clipped * cost_advantage)
+    ratio, clipped = log_weight.exp(), log_weight.clamp(*bounds).exp()
+    products = torch.maximum(ratio * cost_advantage, clipped * cost_advantage)
+    return torch.as_tensor(log_is_weight).exp() * (products - cost_advantage)
 
 
 class CostSurrogateMixin(ViolationMixin):
@@ -50,6 +56,9 @@ class CostSurrogateMixin(ViolationMixin):
                 f"{self.reduction!r}."
             )
         self._log_ratios: Any = None
+
+    def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
+        check_discount(estimator.gamma)
 
     @abc.abstractmethod
     def _penalty(self, surrogate: Tensor) -> Tensor:
@@ -65,11 +74,7 @@ class CostSurrogateMixin(ViolationMixin):
         log_weight, log_is_weight = self._log_ratios
         self._log_ratios = None
         cost_advantage = tensordict.get(self.tensor_keys.cost_advantage)
-        if cost_advantage.shape[-1] != self.num_costs:
-            raise ValueError(
-                f"cost_advantage must have one column for each of the {self.num_costs} costs of "
-                f"num_costs, got shape {tuple(cost_advantage.shape)}."
-            )
+        self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
         surrogate = clipped_cost_surrogate(
             log_weight,
             cost_advantage,

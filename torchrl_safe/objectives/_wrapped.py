@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import fields
-from typing import Any
+from typing import Any, Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import (
@@ -26,8 +26,7 @@ class WrappedLoss(LossModule):
     """Holds an advantage loss and gives it the advantage that :meth:`_mix` makes.
 
     It stands behind a :class:`CostCriticMixin` among the bases, in the place of a parent. Keys,
-    options and networks are those of the loss that it holds, read there each time: there is no
-    copy of them that could differ.
+    options and networks are those of the loss that it holds, and are set here.
     """
 
     # Whole-batch standardization as PPO has it, for losses that have none.
@@ -104,6 +103,15 @@ class WrappedLoss(LossModule):
     def loss_critic_type(self) -> str:
         """The distance that the wrapped loss trains its critic with."""
         return self.loss_module.loss_critic_type
+
+    @property
+    def loss_mask_key(self) -> NestedKey | Literal["auto"] | None:
+        """Which entry of the data marks what counts, in the wrapped loss and here."""
+        return self.loss_module.loss_mask_key
+
+    @loss_mask_key.setter
+    def loss_mask_key(self, value: NestedKey | Literal["auto"] | None) -> None:
+        self.loss_module.loss_mask_key = value
 
     def _loss_mask_keys(self) -> tuple[NestedKey, ...]:
         return self.loss_module._loss_mask_keys()

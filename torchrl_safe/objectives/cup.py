@@ -13,10 +13,11 @@ from tensordict.nn import (
     TensorDictParams,
 )
 from torch import Tensor
-from torch.distributions import kl_divergence
 from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
+from torchrl.objectives.value import GAE, ValueEstimatorBase
 
+from torchrl_safe.objectives._actor import divergence
+from torchrl_safe.objectives._checks import check_discount
 from torchrl_safe.objectives._cost_critic import CostKeys, get_or_raise
 from torchrl_safe.objectives._lagrange import LagrangeMultiplierMixin
 
@@ -76,7 +77,8 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
     paper's is :class:`~torchrl_safe.objectives.DualAscent`. It acts in the projection only.
 
     The divergence is :math:`D_{KL}(\pi_\theta \| \pi_{k + 1/2})`, as in the authors' code
-    (OmniSafe), and must be one that :func:`torch.distributions.kl_divergence` knows.
+    (OmniSafe), and must be one that :func:`torch.distributions.kl_divergence` knows, of each part
+    of a composite action.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): policy operator.
@@ -94,8 +96,9 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
-        ValueError: if ``num_costs`` or ``multiplier_init`` is not usable; in a call, if the cost
-            critic or the costs have another width than ``num_costs``.
+        ValueError: if ``num_costs`` or ``multiplier_init`` is not usable, or the discount of the
+            costs is 1; in a call, if the cost critic or the costs have another width than
+            ``num_costs``.
 
     Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
     ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
@@ -198,8 +201,7 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
 
         Raises:
             KeyError: if the data have no ``cost_advantage``.
-            ValueError: if the cost's value estimator has no trace decay, or the costs have
-                another width than ``num_costs``.
+            ValueError: if the costs have another width than ``num_costs``.
         """
         tensordict = tensordict.clone(False)
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
@@ -208,13 +210,13 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         )
         if log_is_weight is not None:
             log_weight = log_weight + log_is_weight
-        kl = kl_divergence(dist, self._improved_policy(tensordict)).unsqueeze(-1)
+        kl = divergence(dist, self._improved_policy(tensordict)).unsqueeze(-1)
         objective = projection_objective(
             kl, log_weight.exp(), cost_advantage, self.lagrange_multiplier, self._cost_scale()
         )
         losses = TensorDict(
             loss_projection=self._reduce_loss(objective, tensordict).squeeze(-1),
-            kl=kl.detach().mean(),
+            kl=self._reduce_loss(kl.detach(), tensordict, reduction="mean"),
         )
         self._clear_weakrefs(tensordict, losses, "actor_network_params", "improved_actor_params")
         return losses
@@ -225,11 +227,14 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         with self.improved_actor_params.to_module(self.actor_network, preserve_module_state=False):
             return self.actor_network.get_dist(inputs)
 
-    def _cost_scale(self) -> Tensor:
-        estimator = self.cost_value_estimator
+    def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
         if not isinstance(estimator, GAE):
             raise ValueError(
-                "CUP needs the trace decay of the cost's value estimator: it must be a GAE, got "
+                "estimator must be a GAE, whose trace decay the projection needs, got "
                 f"{type(estimator).__name__}."
             )
+        check_discount(estimator.gamma)
+
+    def _cost_scale(self) -> Tensor:
+        estimator = self.cost_value_estimator
         return (1 - estimator.gamma * estimator.lmbda) / (1 - estimator.gamma)

@@ -10,9 +10,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import kl_divergence
 from torchrl.objectives import PPOLoss
 
+from torchrl_safe.objectives._actor import divergence
 from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives._cost_critic import CostKeys
 from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
@@ -163,7 +163,7 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
             tensordict.select(*self._distribution_keys())
         )
         log_weight, dist, *others = super()._log_weight(tensordict, adv_shape)
-        kl = kl_divergence(dist, old).unsqueeze(-1)
+        kl = divergence(dist, old).unsqueeze(-1)
         # Kept for the other term, so that the policy is evaluated once.
         self._kl = kl
         # A ratio of zero leaves a state out of the objective and of its gradient.
@@ -180,7 +180,7 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
         kl, self._kl = self._kl, None
         near = kl.masked_fill(kl > self.kl_bound, 0.0)
         losses.set("loss_kl", self._reduce_loss(near, tensordict).squeeze(-1))
-        losses.set("kl", kl.detach().mean())
+        losses.set("kl", self._reduce_loss(kl.detach(), tensordict, reduction="mean"))
         super()._set_cost_outputs(losses, tensordict)
 
     def _cost_out_keys(self) -> list[NestedKey]:

@@ -17,9 +17,9 @@ def penalized_advantage(
     .. math::
         A = \frac{A_r - \sum_i \lambda_i A_{c_i}}{1 + \sum_i \lambda_i}
 
-    The denominator keeps the size of the policy step independent of the multipliers
-    (Ray et al. 2019, "Benchmarking Safe Exploration in Deep Reinforcement Learning",
-    section 4.2). With every multiplier at zero the result equals ``advantage`` exactly.
+    The denominator keeps the size of the policy step independent of the multipliers, as in the
+    code of Ray et al. 2019, "Benchmarking Safe Exploration in Deep Reinforcement Learning". With
+    every multiplier at zero the result equals ``advantage`` exactly.
 
     Args:
         advantage (Tensor): reward advantage, shape ``(*B, 1)``.

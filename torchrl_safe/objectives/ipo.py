@@ -58,9 +58,11 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
 
     .. math::
         J_{c_i}(\pi_\theta) \approx J_{c_i} + \frac{1}{1 - \gamma}
-            \mathbb{E}[\max(r A_{c_i}, \mathrm{clip}(r) A_{c_i})],
+            \mathbb{E}[\max(r A_{c_i}, \mathrm{clip}(r) A_{c_i}) - A_{c_i}],
 
-    :math:`\gamma` being the discount of the cost's value estimator. The factor :math:`1 - \gamma`
+    :math:`\gamma` being the discount of the cost's value estimator. (The last term, of mean zero
+    over a batch, takes out the noise of minibatches, which the barrier would take for a change of
+    the policy.) The factor :math:`1 - \gamma`
     before the barrier is ours: it brings the barrier, which is about episodes, to the unit of
     PPO's objective, which is about steps, so that t means the same whatever the discount.
 
@@ -87,9 +89,9 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
-        ValueError: if ``num_costs`` or ``sharpness`` is not positive or ``reduction`` is not
-            ``"mean"``; in a call, if the cost critic or the costs have another width than
-            ``num_costs``.
+        ValueError: if ``num_costs`` or ``sharpness`` is not positive, ``reduction`` is not
+            ``"mean"`` or the discount of the costs is 1; in a call, if the cost critic or the
+            costs have another width than ``num_costs``.
 
     Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
     ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.

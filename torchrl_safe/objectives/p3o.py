@@ -45,13 +45,15 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
     et al. 2022 (https://arxiv.org/abs/2205.11814). To the loss of PPO it adds
 
     .. math::
-        \kappa \sum_i \max\left(0,\ \mathbb{E}[\max(r A_{c_i}, \mathrm{clip}(r) A_{c_i})]
+        \kappa \sum_i \max\left(0,\ \mathbb{E}[\max(r A_{c_i}, \mathrm{clip}(r) A_{c_i}) - A_{c_i}]
             + (1 - \gamma) (J_{c_i} - d_i)\right)
 
     as ``"loss_penalty"``. There is no multiplier to learn: for a :math:`\kappa` larger than every
     optimal multiplier the penalty is exact. A :class:`~torchrl_safe.objectives.ViolationUpdater`
     brings the violations :math:`J_{c_i} - d_i`, once for each collected batch. While no limit
     binds the penalty is zero, and the loss :class:`~torchrl.objectives.ClipPPOLoss`, bit for bit.
+    The paper does without the term :math:`-A_{c_i}`, of mean zero over a batch: in a minibatch its
+    noise would look like a violation.
 
     :math:`\gamma` is the discount of the cost's value estimator. The factor
     :math:`1 - \gamma` turns the cost of an episode into the cost of a step, which is the unit of
@@ -74,9 +76,9 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
-        ValueError: if ``num_costs`` or ``penalty_coeff`` is not positive or ``reduction`` is not
-            ``"mean"``; in a call, if the cost critic or the costs have another width than
-            ``num_costs``.
+        ValueError: if ``num_costs`` or ``penalty_coeff`` is not positive, ``reduction`` is not
+            ``"mean"`` or the discount of the costs is 1; in a call, if the cost critic or the
+            costs have another width than ``num_costs``.
 
     Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
     ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.

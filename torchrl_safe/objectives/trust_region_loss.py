@@ -157,11 +157,7 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
             ValueError: if it has another width than ``num_costs``.
         """
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
-        if cost_advantage.shape[-1] != self.num_costs:
-            raise ValueError(
-                f"{self.tensor_keys.cost_advantage!r} must have one column for each of the "
-                f"{self.num_costs} costs, got shape {tuple(cost_advantage.shape)}."
-            )
+        self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
         log_weight, _, _, correction = self._log_weight(
             tensordict.clone(False), adv_shape=cost_advantage.shape[:-1]
         )
