@@ -9,7 +9,7 @@ from torch import nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
 #: Widths of ArmEnv's observation and action with one obstacle and seven joints.
-OBSERVATION, ACTION = 36, 7
+OBSERVATION, ACTION = 40, 7
 
 
 def network(outputs: int) -> MLP:

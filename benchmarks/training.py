@@ -36,10 +36,10 @@ class PaperGymEnv(ArmGymEnv):
             task=env.task,
             obstacles=env.obstacles,
             costs=env.costs,
-            observation=env._observation,
+            observation=env.observation,
             frame_skip=env.frame_skip,
             max_episode_steps=env.max_episode_steps,
-            scene=env._scene,
+            scene=env.scene,
         )
 
 

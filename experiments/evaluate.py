@@ -51,8 +51,8 @@ class Config:
     """Steps in which every episode ends; by default those of the arm's time limit."""
     seed: int = 1_000_000
     """Seed of the episodes."""
-    cost_limit: float | None = None
-    """Limit of the cost of an episode; by default that of the training."""
+    cost_limits: tuple[float, ...] = ()
+    """Limit of each cost of an episode; of a single cost by default that of the training."""
     gui: bool = False
     """Show some episodes in PyBullet's window, in real time. Needs a screen."""
     video: Path | None = None
@@ -63,11 +63,11 @@ class Config:
     """Folder for table.md and results.json; by default the table is only printed."""
 
     def __post_init__(self) -> None:
-        for name in ("episodes", "envs", "shown"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        if self.cost_limit is not None and not 0 <= self.cost_limit < math.inf:
-            raise ValueError(f"cost_limit must not be negative, got {self.cost_limit}.")
+        for name, least in (("episodes", 2), ("envs", 1), ("shown", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}.")
+        if not all(0 <= limit < math.inf for limit in self.cost_limits):
+            raise ValueError(f"cost_limits must not be negative, got {self.cost_limits}.")
         if self.video is not None and self.video.suffix not in (".gif", ".webp"):
             raise ValueError(f"video must end in .gif or .webp, got {str(self.video)!r}.")
         if self.gui and self.env is not None:
@@ -109,6 +109,12 @@ def check_fit(env: EnvBase, saved: SavedPolicy, config: Config) -> None:
                 f"env must have {name} of width {getattr(saved.spec, name)}, which the policy was "
                 f"trained for, got {width}."
             )
+    costs = env.reward_spec["cost"].shape[-1]
+    if len(config.cost_limits or (1,)) != costs:
+        raise ValueError(
+            f"cost_limits must be one for each of the {costs} costs of env, got "
+            f"{config.cost_limits}."
+        )
     if not is_arm(env):
         if config.max_steps is None:
             raise ValueError(f"max_steps must be given, {env} being no ArmEnv, got None.")
@@ -121,18 +127,23 @@ def is_arm(env: EnvBase) -> bool:
     return isinstance(env.base_env if isinstance(env, TransformedEnv) else env, ArmEnv)
 
 
-def play(env: EnvBase, saved: SavedPolicy, config: Config, limit: float) -> dict[str, list[float]]:
+def play(
+    env: EnvBase, saved: SavedPolicy, config: Config, limits: tuple[float, ...]
+) -> dict[str, list[float]]:
     """Plays the episodes; returns their figures, each with its interval where it has one."""
     episodes = evaluate(env, saved.actor, config.episodes, config.seed, config.max_steps)
     costs = episodes["episode_cost"].shape[-1]
     names = env.cost_names if is_arm(env) else tuple(map(str, range(costs)))
-    return {**summarize(episodes, names), **safety(episodes, names, limit)}
+    return {**summarize(episodes, names), **safety(episodes, names, limits)}
 
 
-def safety(episodes: TensorDict, names: tuple[str, ...], limit: float) -> dict[str, list[float]]:
+def safety(
+    episodes: TensorDict, names: tuple[str, ...], limits: tuple[float, ...]
+) -> dict[str, list[float]]:
     """What the means do not tell: episodes above the limit, and the worst tenth of them."""
     figures = {}
-    for name, column in zip(names, episodes["episode_cost"].split(1, -1), strict=True):
+    columns = episodes["episode_cost"].split(1, -1)
+    for name, column, limit in zip(names, columns, limits, strict=True):
         figures[f"above/{name}"] = torch.cat(violation_rate(column, limit)).tolist()
         figures[f"worst/{name}"] = conditional_value_at_risk(column, 0.1).tolist()
     return figures
@@ -157,19 +168,19 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)
     saved = load_policy(config.policy)
     make_env = factory(config, saved)
-    limit = saved.settings["cost_limit"] if config.cost_limit is None else config.cost_limit
+    limits = config.cost_limits or (saved.settings["cost_limit"],)
     env = make_env(num_envs=config.envs)
     try:
         check_fit(env, saved, config)
-        figures = play(env, saved, config, limit)
+        figures = play(env, saved, config, limits)
     finally:
         env.close()
-    text = figures_table({config.policy.parent.name: figures}, limit)
+    text = figures_table({config.policy.parent.name: figures}, limits)
     print(text)
     if config.out is not None:
         config.out.mkdir(parents=True, exist_ok=True)
         (config.out / "table.md").write_text(text)
-        results = {"policy": str(config.policy), "cost_limit": limit, "evaluation": figures}
+        results = {"policy": str(config.policy), "cost_limits": limits, "evaluation": figures}
         (config.out / "results.json").write_text(json.dumps(results, indent=1))
     if config.video is not None:
         stage = make_env(num_envs=1)

@@ -68,7 +68,7 @@ class Config:
     out: Path = dataclasses.field(
         default_factory=lambda: Path("runs", "ray", strftime("%Y-%m-%d_%H-%M-%S"))
     )
-    """Folder for logs."""
+    """Folder for logs and the policy."""
 
 
 def make_env(num_envs: int) -> EnvBase:
@@ -152,7 +152,11 @@ def main(config: Config) -> dict[str, Any]:
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
     settings = train.Config(
-        frames=config.frames, frames_per_batch=config.frames_per_batch, seed=config.seed
+        cost_limit=config.cost_limits[0],
+        frames=config.frames,
+        frames_per_batch=config.frames_per_batch,
+        seed=config.seed,
+        out=config.out,
     )
     env = make_env(num_envs=8)
     training = ALGORITHMS["ppo-lagrangian"].build(env, settings)
@@ -180,6 +184,7 @@ def main(config: Config) -> dict[str, Any]:
                 bar.update()
         finally:
             collection.close()
+    train.keep_policy(settings, "ppo-lagrangian", training)
     return {**log.rows[-1], "replaced": collection.replaced}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ COLOURS = ("tab:orange", "tab:blue", "tab:green", "tab:purple")
 def table(results: dict[str, Any]) -> str:
     """Returns a Markdown table: a row for each algorithm, estimates with 95 % intervals."""
     rows = {name: run["evaluation"] for name, run in results["algorithms"].items()}
-    return figures_table(rows, results["config"]["cost_limit"])
+    return figures_table(rows, [results["config"]["cost_limit"]])
 
 
-def figures_table(rows: dict[str, dict[str, list[float]]], cost_limit: float) -> str:
+def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Sequence[float]) -> str:
     """Returns a Markdown table of named rows of figures, each with its interval or without."""
     columns = list(next(iter(rows.values())))
     lines = [
@@ -34,7 +34,8 @@ def figures_table(rows: dict[str, dict[str, list[float]]], cost_limit: float) ->
     for name, row in rows.items():
         cells = (_cell(*row[column], share=_is_share(column)) for column in columns)
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    lines.append(f"\nCost limit {cost_limit:g}; brackets: 95 % confidence.")
+    limits = ", ".join(f"{limit:g}" for limit in cost_limits)
+    lines.append(f"\nCost limit {limits}; brackets: 95 % confidence.")
     return "\n".join(lines)
 
 

@@ -27,7 +27,7 @@ from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
-from experiments.algorithms import ALGORITHMS, OffPolicy
+from experiments.algorithms import ALGORITHMS, OffPolicy, Training
 from experiments.evaluation import evaluate, summarize
 from experiments.files import is_new, write_whole
 from experiments.log import Log, figures, score
@@ -172,6 +172,10 @@ class Config:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
+        if self.paper and (self.arm, self.obstacles) != (Config.arm, Config.obstacles):
+            raise ValueError(
+                f"paper has an arm and an obstacle of its own, got {self.arm} and {self.obstacles}."
+            )
         for name in self.algorithms:
             if self.paper and isinstance(ALGORITHMS[name], OffPolicy):
                 raise ValueError(
@@ -309,9 +313,14 @@ def train(
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
                 recent = log.rows[-config.checkpoint_every :]
                 checkpoints.save(log.frames, score=score(recent, config.cost_limit))
+    keep_policy(config, algorithm, training)
+    return training.actor, log
+
+
+def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) -> None:
+    """Writes the policy to a file of its own, with what it was trained for."""
     trained = {**json.loads(json.dumps(dataclasses.asdict(config), default=str)), "name": algorithm}
     save_policy(config.out / algorithm / "policy.pt", training.actor, training.actor_spec, trained)
-    return training.actor, log
 
 
 def train_and_evaluate(

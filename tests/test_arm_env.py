@@ -437,6 +437,19 @@ def test_numpy_integers_are_integers(make_env):
     assert env.control_rate == 40
 
 
+def test_a_step_before_the_first_reset_is_refused(make_env):
+    env = make_env(ArmEnv, num_envs=2)
+    action = TensorDict(action=torch.zeros(2, 3), batch_size=[2])
+    with pytest.raises(RuntimeError, match="ArmEnv must be reset before its first step"):
+        env.step(action)
+
+
+def test_it_shows_what_it_is_made_of(make_env):
+    shown = repr(make_env(ArmEnv, num_envs=2, obstacles=NoObstacles()))
+    for part in ("num_envs=2", "CartesianDelta(step=0.05", "obstacles=NoObstacles()", "collision"):
+        assert part in shown
+
+
 def test_closed_environment_says_so(make_env):
     """Its server's number may belong to another environment by then."""
     closed = ArmEnv(seed=0)

@@ -55,8 +55,11 @@ def test_without_checkpoints_nothing_is_loaded(run, net):
     assert torch.equal(before, net.weight)
     assert run.best() is None
     save(run, net, 1)
+    notes = run.folder / "notes.txt"
+    notes.touch()
     run.clear()
     assert run.load() is None
+    assert list(run.folder.iterdir()) == [notes], "only checkpoints are removed"
 
 
 def cut(path):

@@ -53,6 +53,21 @@ def test_the_trainers_need_the_losses_only():
     )
 
 
+def test_the_transforms_need_no_simulator():
+    """PyBullet has no wheel for some Pythons; only who makes an arm is told what is missing."""
+    code = (
+        "import sys; sys.modules['pybullet'] = None\n"
+        "from torchrl_safe.envs import ArmEnv, CostToReward, EarlyTermination, Saute\n"
+        "print(Saute(1.0, unsafe_reward=-1.0))\n"
+        "ArmEnv()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert "Saute" in done.stdout
+    assert 'ImportError: Robot arms need PyBullet: pip install "torchrl-safe[arms]"' in done.stderr
+
+
 def test_the_metrics_need_neither_simulator_nor_environments_nor_losses():
     assert load("torchrl_safe.metrics") == {"torchrl_safe.metrics"}
 
@@ -110,5 +125,9 @@ def test_environments_and_losses_are_apart(importer, forbidden):
 
 def test_three_files_talk_to_pybullet():
     sources = (PACKAGE / "envs").rglob("*.py")
-    users = {path.name for path in sources if "pybullet" in set(imported_modules(path))}
+    users = {
+        path.name
+        for path in sources
+        if "torchrl_safe.envs._pybullet.pybullet" in set(imported_modules(path))
+    }
     assert users == {"bullet.py", "bodies.py", "sensors.py"}

@@ -390,7 +390,7 @@ def test_costs_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"multiplier_init.* 2 costs.*\(3,\)"):
         wrap(A2CLoss, 2, multiplier_init=torch.ones(3))
     loss = LagrangianLoss(A2CLoss(actor, critic), cost_critic, num_costs=2)
-    with pytest.raises(ValueError, match=r"'cost'.* one column for each of the 2 costs.*\(4, 6, 3\)"):
+    with pytest.raises(ValueError, match=r"'cost'.* one column for each of the 2 costs"):
         loss(loss.estimate_advantages(make_batch(3)).reshape(-1))
     for call in (loss, loss.estimate_advantages):
         with pytest.raises(KeyError, match=r"\('next', 'cost'\)"):

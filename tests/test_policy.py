@@ -170,7 +170,7 @@ def mine(tmp_path, monkeypatch):
 
 
 def test_evaluation_in_an_environment_of_ones_own(mine, trained, tmp_path, capsys):
-    settings = {"episodes": 2, "envs": 2, "cost_limit": 3.0}
+    settings = {"episodes": 2, "envs": 2, "cost_limits": (3.0,)}
     evaluate.main(evaluate.Config(trained[1], env="mine:arm", **settings))
     shown = capsys.readouterr().out
     assert "episode cost: fast" in shown
@@ -181,7 +181,7 @@ def test_evaluation_in_an_environment_of_ones_own(mine, trained, tmp_path, capsy
 def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):
     spec = ActorSpec(observations=3, actions=1, noise="same", bounded=True)
     save_policy(tmp_path / "policy.pt", make_actor(spec), spec, {})
-    settings = {"env": "mine:pendulum", "episodes": 2, "cost_limit": 0.0}
+    settings = {"env": "mine:pendulum", "episodes": 2, "cost_limits": (0.0, 2.0, 3.0)}
     evaluate.main(evaluate.Config(tmp_path / "policy.pt", max_steps=5, **settings))
     shown = capsys.readouterr().out
     assert "episode cost: 2" in shown
@@ -195,8 +195,9 @@ def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"episodes": 0}, "episodes must be at least 1, got 0"),
-        ({"cost_limit": -1.0}, "cost_limit must not be negative, got -1.0"),
+        ({"episodes": 1}, "episodes must be at least 2, got 1"),
+        ({"cost_limits": (-1.0,)}, "cost_limits must not be negative, got .-1.0"),
+        ({"cost_limits": (1.0, 2.0)}, "cost_limits must be one for each of the 1 costs of env"),
         ({"video": Path("a.mov")}, "video must end in .gif or .webp, got 'a.mov'"),
         ({"gui": True, "env": "mine:arm"}, "gui must not be given with env"),
         ({"env": "mine"}, "env must be module:function, got 'mine'"),

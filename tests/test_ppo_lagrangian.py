@@ -503,7 +503,7 @@ def test_a_cost_critic_of_the_wrong_width_is_refused(call):
 
 def test_a_loss_of_the_wrong_width_is_refused():
     loss = PPOLagrangianLoss(*make_networks(3), num_costs=2)
-    with pytest.raises(ValueError, match=r"'cost'.* one column for each of the 2 costs.*\(4, 6, 3\)"):
+    with pytest.raises(ValueError, match=r"'cost'.* one column for each of the 2 costs"):
         loss(estimated(loss, 3))
 
 

@@ -8,6 +8,7 @@ import torch
 
 from experiments import train
 from experiments.algorithms import ALGORITHMS
+from experiments.policy import load_policy
 from experiments.ray_training import COSTS, Collection, Config, cluster, main, make_env
 
 # Ray leaves sockets and files to the garbage collector when a cluster is shut down.
@@ -30,6 +31,7 @@ def test_two_costs_and_their_multipliers(tmp_path):
     assert len(multipliers) == 3
     assert multipliers == sorted(multipliers)
     assert multipliers[-1] == pytest.approx(last["multiplier/collision"])
+    assert load_policy(tmp_path / "ppo-lagrangian" / "policy.pt").settings["cost_limit"] == 0
 
 
 def test_an_actor_is_killed_on_the_way():

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from torchrl_safe.envs import IIWA, ArmEnv, Scattered
 from torchrl_safe.objectives import (
+    CRPOLoss,
     DualAscent,
     LagrangianLoss,
     PIDControl,
@@ -20,6 +21,7 @@ from torchrl_safe.objectives import (
 from torchrl_safe.trainers import PPOLagrangianTrainer
 from torchrl_safe.trainers.configs import (
     ArmEnvConfig,
+    CRPOLossConfig,
     DualAscentConfig,
     LagrangianLossConfig,
     PIDControlConfig,
@@ -49,6 +51,7 @@ def read(folder, *overrides):
 CONFIGS = {
     ArmEnvConfig: ArmEnv,
     LagrangianLossConfig: LagrangianLoss,
+    CRPOLossConfig: CRPOLoss,
     DualAscentConfig: DualAscent,
     PIDControlConfig: PIDControl,
     ViolationUpdaterConfig: ViolationUpdater,
@@ -63,7 +66,7 @@ def test_each_argument_with_its_default(config, made):
     fields = {name for name in node if not name.startswith("_")}
     parameters = dict(inspect.signature(made.__init__).parameters)
     del parameters["self"]
-    if made not in (ArmEnv, LagrangianLoss):
+    if made not in (ArmEnv, LagrangianLoss, CRPOLoss):
         del parameters["loss_module"]  # It is given by the trainer.
     assert fields == set(parameters)
     for name, parameter in parameters.items():
@@ -118,6 +121,20 @@ def test_another_rule_and_two_costs(example):
     assert updater.cost_limit.tolist() == [1, 2]
     updater.step(torch.tensor([[3.0, 2.0]]))
     assert loss.lagrange_multiplier.tolist() == pytest.approx([1.2, 0])
+
+
+def test_a_loss_that_reads_violations(example):
+    path = example / "crpo.yaml"
+    documented = (example / "config.yaml").read_text(encoding="utf-8")
+    text = documented.replace("loss: lagrangian", "loss: crpo")
+    text = text.replace("updater: dual_ascent", "updater: violation").replace("  lr: 0.2\n", "")
+    path.write_text(text, encoding="utf-8")
+    with initialize_config_dir(str(example), version_base="1.3"):
+        trainer = instantiate(compose("crpo").trainer)
+    assert isinstance(trainer.loss_module, CRPOLoss)
+    trainer._modules["multiplier"].updater.step(torch.tensor([[2.0]]))
+    assert trainer.loss_module.cost_violation.tolist() == [1.5]
+    trainer.shutdown()
 
 
 def test_other_parts_of_an_arm():

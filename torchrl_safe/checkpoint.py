@@ -17,6 +17,9 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
+# Where a checkpoint is written before it gets its name.
+_UNFINISHED = ".unfinished"
+
 
 class RunCheckpoints:
     """The checkpoints of one run: the last ones and the best, each a file of its own.
@@ -92,7 +95,7 @@ class RunCheckpoints:
         scores = {} if score is None else {"score": score}
         metadata = {"settings": self.settings, **scores}
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
-        unfinished = self.folder / ".unfinished"
+        unfinished = self.folder / _UNFINISHED
         shutil.rmtree(unfinished, ignore_errors=True)  # Of a process that was killed.
         try:
             written = self._checkpoint.save(unfinished / path.name, metadata=metadata)
@@ -120,7 +123,7 @@ class RunCheckpoints:
                 why not. The components may have changed then.
         """
         refused = []
-        for path in sorted(self.folder.glob("checkpoint-*.torchrl"), reverse=True):
+        for path in reversed(self._files()):
             try:
                 step = self._load(path)
             except Exception as error:  # A torn file makes its readers stumble anywhere.
@@ -140,8 +143,13 @@ class RunCheckpoints:
         return self._rotation.best()
 
     def clear(self) -> None:
-        """Removes all checkpoints."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Removes all checkpoints, and nothing else that is in the folder."""
+        shutil.rmtree(self.folder / _UNFINISHED, ignore_errors=True)
+        for path in self._files():
+            path.unlink()
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("checkpoint-*.torchrl"))
 
     def _load(self, path: Path) -> int:
         manifest = Checkpoint.manifest(path)

@@ -6,8 +6,8 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -18,7 +18,8 @@ class ResumableCollector(Collector):
     The state of :class:`~torchrl.collectors.Collector` holds policy, transforms and counters:
     one that is loaded starts all episodes anew. This one also holds the simulator's state, the
     last observations with the running sums of :class:`~torchrl.envs.RewardSum` and all else that
-    is carried from step to step, and the state of torch's generator that the policy draws from.
+    is carried from step to step, and the state of the global generators, from torch's of which the
+    policy draws.
     A collector that is loaded between two batches then collects what the saved one would have
     collected, bit for bit. It takes an environment whose ``state_dict`` is complete, such as
     :class:`~torchrl_safe.envs.ArmEnv`, with any transforms around it, in this process or, as the
@@ -29,6 +30,7 @@ class ResumableCollector(Collector):
     Arguments are those of :class:`~torchrl.collectors.Collector`.
 
     Examples:
+        >>> import torch
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.envs import RewardSum, TransformedEnv
         >>> from torchrl_safe.envs import ArmEnv
@@ -58,11 +60,11 @@ class ResumableCollector(Collector):
         if _is_complete(simulator):
             state["base_env_state_dict"] = simulator
             state["carrier"] = self._carrier.exclude("next").clone().to_dict()
-        state["torch_generator"] = torch.get_rng_state()
+        state["generators"] = GlobalRNGState().state_dict()
         return state
 
     def load_state_dict(self, state_dict: OrderedDict, **kwargs: Any) -> None:
-        """Loads a state that :meth:`state_dict` returned."""
+        """Loads a state that :meth:`state_dict` returned; that of a ``Collector`` as it does."""
         super().load_state_dict(state_dict, **kwargs)
         if "traj_pool" in state_dict:  # The method above has drawn new numbers from it.
             self._traj_pool.load_state_dict(state_dict["traj_pool"])
@@ -73,7 +75,8 @@ class ResumableCollector(Collector):
                 batch_size=self._carrier.batch_size,
                 device=self._carrier.device,
             ).clone()
-        torch.set_rng_state(state_dict["torch_generator"])
+        if "generators" in state_dict:
+            GlobalRNGState().load_state_dict(state_dict["generators"])
 
 
 def _is_complete(state: Mapping[str, Any]) -> bool:

@@ -25,7 +25,8 @@ is above the limit.
 #
 # These are small, so that the tutorial runs in seconds and shows how the parts fit. To see the arm
 # learn, set ``TOTAL_FRAMES = 256_000``, ``FRAMES_PER_BATCH = 2_048`` and ``NUM_ENVS = 32``, which
-# takes some minutes, or run ``make train``, which does the same with two processes.
+# takes some minutes. ``make train`` is a longer recipe, which is more certain to keep the limit:
+# ``docs/limits.md`` says what it adds and why.
 
 import torch
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
@@ -146,11 +147,11 @@ for batch in collector:
     history.append(
         {
             "return": batch["next", "episode_reward"][ended].mean().item(),
-            "cost": batch["next", "episode_cost"][ended].mean().item(),
-            "multiplier": loss.lagrange_multiplier.item(),
+            "cost": batch["next", "episode_cost"][ended].mean(0).tolist(),
+            "multiplier": loss.lagrange_multiplier.tolist(),
         }
     )
-    print({key: round(value, 2) for key, value in history[-1].items()})
+    print(history[-1])
 
 # %%
 # What it has learnt
@@ -164,7 +165,7 @@ with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
 first_end = play["next", "done"].squeeze(-1).int().argmax(1)
 end = play["next"][torch.arange(NUM_ENVS), first_end]
 print("success:", end["success"].float().mean().item())
-print("cost of an episode:", end["episode_cost"].mean().item(), "limit:", COST_LIMIT)
+print("cost of an episode:", end["episode_cost"].mean(0).tolist(), "limit:", COST_LIMIT)
 
 picture = test_env.render(width=320, height=240)[0]
 print("picture:", tuple(picture.shape))

@@ -1,4 +1,7 @@
-"""Robot arms with costs as TorchRL environments. Needs the ``arms`` extra (PyBullet)."""
+"""Robot arms with costs as TorchRL environments, and transforms for any environment with costs.
+
+Only the arms need the ``arms`` extra (PyBullet).
+"""
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv

@@ -76,8 +76,9 @@ class ArmEnv(EnvBase):
             2 s at 20 Hz.
         scene (Scene, optional): how the world is simulated. Defaults to ``Scene()``.
         seed (int, optional): seed of the goals and obstacles. Every row has a generator of its
-            own; the seeds follow TorchRL's chain, so that two environments of one world in a
-            ``ParallelEnv`` draw what one environment of two worlds draws.
+            own; the seeds follow TorchRL's chain: after ``set_seed`` of a ``ParallelEnv`` or a
+            collector, two environments of one world draw what one of two worlds draws. A seed
+            that a factory gives to several workers is the same in each: leave it out there.
         device (torch.device, optional): device of the tensors. Defaults to ``None``.
         gui (bool, optional): show the first world in PyBullet's window. Defaults to ``False``.
 
@@ -85,7 +86,8 @@ class ArmEnv(EnvBase):
         TypeError: if an argument is not of its kind.
         ValueError: if an argument is not usable, an action, observation, reward or cost is not
             finite or has the wrong shape, or the obstacles overlap the arm at home.
-        RuntimeError: if the environment is closed, or ``gui`` is wanted and there is no screen.
+        RuntimeError: if the environment is closed or not yet reset, or ``gui`` is wanted and there
+            is no screen.
 
     Examples:
         >>> env = ArmEnv(num_envs=2, seed=0)
@@ -140,14 +142,15 @@ class ArmEnv(EnvBase):
         self.costs = dict(costs)
         self.frame_skip = frame_skip
         self.max_episode_steps = max_episode_steps
-        self._observation = observation
+        self.observation = observation
         # What touches objects has friction and stiffness of its own, link by link.
-        self._scene = replace(
+        self.scene = replace(
             scene,
             free_fingers=scene.free_fingers or action.moves_fingers,
             merged_links=scene.merged_links and not task.objects,
         )
         self._elapsed = np.zeros(num_envs, dtype=int)
+        self._begun = False
         self._record = EpisodeRecord(num_envs)
         self.set_seed(seed)
         sensors = {name: cost.sensing for name, cost in costs.items() if isinstance(cost, Sensor)}
@@ -156,7 +159,7 @@ class ArmEnv(EnvBase):
         self._batch = WorldBatch(
             num_envs,
             arm,
-            self._scene,
+            self.scene,
             obstacles.shapes,
             task.objects,
             sensing=reduce(or_, sensors.values(), Sensing()),
@@ -170,6 +173,17 @@ class ArmEnv(EnvBase):
             self._batch.close()
             raise
         self.is_closed = False
+
+    def extra_repr(self) -> str:
+        parts = {
+            "arm": self.arm.urdf,
+            "num_envs": self.num_envs,
+            "action": self.action_mode,
+            "task": self.task,
+            "obstacles": self.obstacles,
+            "costs": self.costs,
+        }
+        return "\n".join(f"{name}={part}" for name, part in parts.items())
 
     @property
     def _worlds(self) -> list[World]:
@@ -226,7 +240,7 @@ class ArmEnv(EnvBase):
             (self.num_envs, joints),
         )
         self._outcome(state)
-        fields = self._observation(state)
+        fields = self.observation(state)
         check_kind("what observation returns", fields, Mapping)
         if not fields:
             raise ValueError("observation must return at least one field, got none.")
@@ -273,6 +287,7 @@ class ArmEnv(EnvBase):
         rows = range(self.num_envs) if chosen is None else chosen.flatten().nonzero().flatten()
         for row in rows:
             self._reset_world(int(row), self._generators[int(row)])
+        self._begun = True
         self._state = self._batch.state()
         return self._pack(
             observation=self._observe(self._state),
@@ -281,9 +296,11 @@ class ArmEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check_open()
+        if not self._begun:
+            raise RuntimeError("ArmEnv must be reset before its first step.")
         action = self._check_action(tensordict.get("action"))
         joints, fingers = self.action_mode.targets(action, self._state, self._worlds)
-        if self._scene.motor_limits:
+        if self.scene.motor_limits:
             joints, fingers = self._within_speed(joints, fingers)
         self._record.add(self._elapsed, joints, fingers)
         self._batch.advance(joints, fingers)
@@ -349,6 +366,7 @@ class ArmEnv(EnvBase):
             self._reset_world(row, unpack(state["draws"][row]))
             for target in state["targets"][row, :steps].tolist():
                 self._batch.advance_row(row, target[:joints], target[joints:])
+        self._begun = True
         self._elapsed = state["elapsed"].numpy().copy()
         self._record.targets = state["targets"].numpy().copy()
         self._generators = [unpack(packed) for packed in state["generators"]]
@@ -455,7 +473,7 @@ class ArmEnv(EnvBase):
         self._elapsed[row] = 0
 
     def _observe(self, state: ArmState) -> Array:
-        fields = self._observation(state).values()
+        fields = self.observation(state).values()
         observation = np.concatenate([*fields], axis=1)
         return check_array("observation", observation, observation.shape)
 

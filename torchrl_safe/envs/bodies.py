@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pybullet
-import pybullet_data
 
+from torchrl_safe.envs._pybullet import pybullet, pybullet_data
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.scene import Scene
 from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
@@ -22,7 +21,6 @@ _WOOD = (0.72, 0.58, 0.42, 1.0)
 _UNLIMITED_EFFORT = 1e5
 # More than the fingers' motors can do, N.
 _GEAR_FORCE = 1e3
-_DATA = Path(pybullet_data.getDataPath())
 
 
 @dataclass(frozen=True)
@@ -155,21 +153,19 @@ def load_furniture(client: int, scene: Scene, *, visuals: bool) -> list[int]:
     """Loads the scene's furniture, or a table whose top is at height 0."""
     if scene.furniture:
         return [
-            pybullet.loadURDF(
-                str(_DATA / urdf), position, useFixedBase=True, physicsClientId=client
-            )
+            pybullet.loadURDF(_data(urdf), position, useFixedBase=True, physicsClientId=client)
             for urdf, position in scene.furniture
         ]
     table = Box(half_extents=(0.75, 0.6, 0.025))
     body = add_shape(client, table, (0.5, 0, -0.025), _WOOD if visuals else None)
     if visuals:
-        pybullet.loadURDF(str(_DATA / "plane.urdf"), (0, 0, -0.7), physicsClientId=client)
+        pybullet.loadURDF(_data("plane.urdf"), (0, 0, -0.7), physicsClientId=client)
     return [body]
 
 
 def load_body(client: int, urdf: str, position: Sequence[float]) -> int:
     """Loads a URDF file of ``pybullet_data`` that is free to move."""
-    return pybullet.loadURDF(str(_DATA / urdf), position, physicsClientId=client)
+    return pybullet.loadURDF(_data(urdf), position, physicsClientId=client)
 
 
 def add_shape(
@@ -206,3 +202,7 @@ def _geometry(shape: Shape) -> tuple[int, dict[str, Any]]:
             return pybullet.GEOM_SPHERE, {"radius": shape.radius}
         case Capsule():
             return pybullet.GEOM_CAPSULE, {"radius": shape.radius, "height": shape.length}
+
+
+def _data(urdf: str) -> str:
+    return str(Path(pybullet_data.getDataPath(), urdf))

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
+from torchrl_safe.envs._pybullet import pybullet
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.bodies import (
     add_marker,

@@ -36,7 +36,8 @@ class Collision:
         margin: distance up to which a contact point counts as a touch, m. PyBullet reports
             contact points from 0.02 m before the bodies meet.
         table: count the table too (not what the base stands on).
-        itself: count links of the arm that touch each other, unless they overlap at home.
+        itself: count links of the arm that touch each other, unless they overlap at home. They
+            then stop each other, where they otherwise pass through.
 
     Raises:
         ValueError: if ``margin`` is not between 0 and 0.02.

@@ -6,8 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
-import pybullet
-
+from torchrl_safe.envs._pybullet import pybullet
 from torchrl_safe.envs.bodies import LoadedArm
 from torchrl_safe.envs.state import Array, Sensing
 

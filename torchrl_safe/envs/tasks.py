@@ -96,7 +96,8 @@ class Push:
     Reward, success within 0.05 m and the cube are those of panda-gym's PandaPush (Gallouédec et
     al. 2021, arXiv 2106.13687): the reward of a step is minus the distance between cube and goal,
     in metres; success ends the episode (``terminated``). Other than there, the cube never starts
-    near its goal, so that there is a way to go and room for an obstacle on it.
+    near its goal, so that there is a way to go and room for an obstacle on it. It takes longer than
+    reaching: give the environment ``max_episode_steps=200``.
 
     Args:
         region: where the cube and its goal are drawn, uniformly; heights do not matter. ``None``
@@ -152,7 +153,7 @@ class PickAndPlace:
     ends the episode (``terminated``). As in :class:`Push`, the cube never starts near its goal.
     It weighs 0.1 kg instead of 1 kg: panda-gym's fingers press with 170 N, a Panda's URDF allows
     20 N, from which 1 kg slips whenever the arm starts to move fast. The action must move the
-    fingers: ``CartesianDelta(finger_step=0.04)``.
+    fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs ``max_episode_steps=100``.
 
     Args:
         region: where the goal is drawn, uniformly, and the cube below; a goal in the air is not

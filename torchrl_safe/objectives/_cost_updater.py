@@ -55,13 +55,16 @@ class CostUpdater(abc.ABC):
                 shape ``(E, k)``. With ``E = 0`` nothing changes.
 
         Raises:
-            ValueError: if the shape is wrong or a cost is NaN or infinite; nothing has changed
+            TypeError: if it is no tensor.
+            ValueError: if the shape is wrong or a cost is NaN or infinite. Nothing has changed
                 then.
 
         With :class:`~torchrl.envs.RewardSum` a collector's batch gives it as
         ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``.
         """
         buffer = getattr(self.loss_module, self.buffer_name)
+        if not isinstance(episode_cost, Tensor):
+            raise TypeError(f"episode_cost must be a tensor, got {episode_cost!r}.")
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:
             raise ValueError(
                 f"episode_cost must have shape (E, {len(buffer)}), got {tuple(episode_cost.shape)}."
@@ -90,7 +93,10 @@ class CostUpdater(abc.ABC):
         return {"cost_limit": self.cost_limit.clone(), "pessimism": self.pessimism}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Loads a state that :meth:`state_dict` returned.
+        """Loads a state that :meth:`state_dict` returned, with its limits and options.
+
+        As torch's optimizers do, it forgets those that this updater was made with; to go on under
+        another limit, set ``cost_limit`` afterwards.
 
         Raises:
             ValueError: if the state is of another kind of updater or another number of costs.

@@ -8,9 +8,10 @@ After :func:`register_configs` the groups of TorchRL have these names too, and t
 ``env=arm``                     :class:`~torchrl_safe.envs.ArmEnv`
 ``loss=lagrangian``             :class:`~torchrl_safe.objectives.LagrangianLoss`, around the loss
                                 of any other name of the group, at ``loss.loss_module``
+``loss=crpo``                   :class:`~torchrl_safe.objectives.CRPOLoss`, the same
 ``updater=dual_ascent``         :class:`~torchrl_safe.objectives.DualAscent`
 ``updater=pid_control``         :class:`~torchrl_safe.objectives.PIDControl`
-``updater=violation``           :class:`~torchrl_safe.objectives.ViolationUpdater`
+``updater=violation``           :class:`~torchrl_safe.objectives.ViolationUpdater`, for CRPO
 ``trainer=ppo_lagrangian``      :class:`~torchrl_safe.trainers.PPOLagrangianTrainer`
 =============================== ==============================================================
 """
@@ -73,17 +74,31 @@ class ArmEnvConfig(EnvLibsConfig):
 
 
 @dataclass
-class LagrangianLossConfig(LossConfig):
-    """Configuration of :class:`~torchrl_safe.objectives.LagrangianLoss`."""
+class WrappingLossConfig(LossConfig):
+    """What the configurations of losses around a loss share."""
 
     loss_module: Any = MISSING
     cost_critic_network: Any = MISSING
     num_costs: int = 1
-    multiplier_init: Any = 0.0
     cost_critic_coeff: float = 1.0
     separate_losses: bool = False
     _convert_: str = "all"
+
+
+@dataclass
+class LagrangianLossConfig(WrappingLossConfig):
+    """Configuration of :class:`~torchrl_safe.objectives.LagrangianLoss`."""
+
+    multiplier_init: Any = 0.0
     _target_: str = "torchrl_safe.objectives.LagrangianLoss"
+
+
+@dataclass
+class CRPOLossConfig(WrappingLossConfig):
+    """Configuration of :class:`~torchrl_safe.objectives.CRPOLoss`."""
+
+    tolerance: float = 0.0
+    _target_: str = "torchrl_safe.objectives.CRPOLoss"
 
 
 @dataclass
@@ -186,6 +201,7 @@ def register_configs() -> None:
     store = ConfigStore.instance().store
     store(group="env", name="arm", node=ArmEnvConfig)
     store(group="loss", name="lagrangian", node=LagrangianLossConfig)
+    store(group="loss", name="crpo", node=CRPOLossConfig)
     store(group="updater", name="dual_ascent", node=DualAscentConfig)
     store(group="updater", name="pid_control", node=PIDControlConfig)
     store(group="updater", name="violation", node=ViolationUpdaterConfig)
