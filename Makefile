@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow compare paper sweep profile gallery bench ray lint format type clean
+.PHONY: train test test-slow compare paper sweep profile gallery bench ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -38,6 +38,9 @@ ray: $(READY)  ## two costs on a Ray cluster; on this machine, or on yours with 
 gallery: $(READY)  ## the contact sheet of docs/environments.md
 	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)
 
+docs: $(READY)  ## these pages, the tutorial and the API reference as a web site, in docs/_build
+	$(BIN)/sphinx-build -qW docs docs/_build
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -51,7 +54,7 @@ type: $(READY)
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) runs docs/_build docs/tutorials
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

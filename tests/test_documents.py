@@ -36,7 +36,7 @@ def test_readme_loop(tmp_path):
     assert short != code
     script = tmp_path / "readme.py"
     script.write_text(short, encoding="utf-8")
-    lines = re.findall(r"cost (\S+) multiplier (\S+)", run(script))
+    lines = re.findall(r"cost \[(\S+)\] multiplier \[(\S+)\]", run(script))
     assert len(lines) == 2
     multiplier = 0.0
     for cost, shown in lines:
