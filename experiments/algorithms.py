@@ -100,6 +100,15 @@ def tell_violation(loss: LossModule, config: Config) -> Updater:
     return ViolationUpdater(loss, cost_limit=config.cost_limit, pessimism=config.pessimism)
 
 
+def tell_mean_violation(loss: LossModule, config: Config) -> Updater:
+    """The same without pessimism, for losses that act on any violation with all their weight.
+
+    Two standard errors are more than a limit of rare costs: such a loss then keeps the arm away
+    from everything before it has learnt to reach.
+    """
+    return ViolationUpdater(loss, cost_limit=config.cost_limit)
+
+
 def no_transforms(config: Config) -> list[Transform]:
     """The environment as it is."""
     return []
@@ -241,9 +250,9 @@ ALGORITHMS: dict[str, Algorithm] = {
     "pcpo": OnPolicy(_of_ppo(TrustRegionLoss), tell_violation, method=PCPO()),
     "focops": OnPolicy(_of_ppo(FOCOPSLoss)),
     "cup": OnPolicy(_of_ppo(CUPLoss), projects=True),
-    "p3o": OnPolicy(_of_ppo(P3OLoss), tell_violation),
-    "ipo": OnPolicy(_of_ppo(IPOLoss), tell_violation),
-    "crpo": OnPolicy(_wrapping(CRPOLoss, ClipPPOLoss), tell_violation),
+    "p3o": OnPolicy(_of_ppo(P3OLoss), tell_mean_violation),
+    "ipo": OnPolicy(_of_ppo(IPOLoss), tell_mean_violation),
+    "crpo": OnPolicy(_wrapping(CRPOLoss, ClipPPOLoss), tell_mean_violation),
     "ppo-saute": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, transforms=_with_budget),
     "ppo-early-termination": OnPolicy(
         _of_ppo(PPOLagrangianLoss), keep_multiplier, training_transforms=_terminating

@@ -155,7 +155,8 @@ class Config:
     """Step size of the multiplier, once a batch, in units of the episode cost's standard
     deviation; the integral gain of pid, whose other two gains are five times as large."""
     pessimism: float = 2.0
-    """Standard errors added to the mean cost of a batch before it is compared with the limit."""
+    """Standard errors added to the mean cost of a batch before it is compared with the limit; p3o,
+    ipo and crpo do without."""
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs")
