@@ -12,6 +12,13 @@ import torchrl_safe
 PACKAGE = Path(torchrl_safe.__file__).parent
 
 
+def run(code):
+    """Runs a program in a new process."""
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+
+
 def load(package):
     """Names of our modules and PyBullet's that one import loads in a new process."""
     code = (
@@ -19,9 +26,8 @@ def load(package):
         "print(*(n for n in sys.modules if n.split('.')[0] == 'pybullet'\n"
         "        or n.startswith(('pybullet', 'torchrl_safe.'))))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
-    )
+    done = run(code)
+    assert done.returncode == 0, done.stderr
     return set(done.stdout.split())
 
 
@@ -39,9 +45,7 @@ def test_the_trainers_need_the_losses_only():
         "print(*(n for n in sys.modules if n.startswith(('pybullet', 'torchrl_safe.'))))\n"
         "import torchrl_safe.trainers.configs"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
+    done = run(code)
     loaded = set(done.stdout.split())
     assert "torchrl_safe.trainers.multiplier_hook" in loaded
     packages = ("torchrl_safe.objectives", "torchrl_safe.trainers")
@@ -61,9 +65,7 @@ def test_the_transforms_need_no_simulator():
         "print(Saute(1.0, unsafe_reward=-1.0))\n"
         "ArmEnv()"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
+    done = run(code)
     assert "Saute" in done.stdout
     assert 'ImportError: Robot arms need PyBullet: pip install "torchrl-safe[arms]"' in done.stderr
 
@@ -74,9 +76,7 @@ def test_the_metrics_need_neither_simulator_nor_environments_nor_losses():
 
 def test_the_metrics_say_what_they_need():
     code = "import sys; sys.modules['scipy'] = None; import torchrl_safe.metrics"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
+    done = run(code)
     assert done.returncode != 0
     assert 'ImportError: torchrl_safe.metrics needs SciPy: pip install "torchrl-safe[metrics]"' in (
         done.stderr
