@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import Compose, GymEnv, RewardSum, SerialEnv, TransformedEnv
@@ -242,10 +243,11 @@ def test_a_loaded_collector_ends_where_the_saved_one_would():
 
 
 def test_without_transforms_and_as_torchrls_own(make_env):
-    for kind in (Collector, ResumableCollector):
+    kinds = [(Collector, Collector), (ResumableCollector,) * 2, (Collector, ResumableCollector)]
+    for pair in kinds:
         one, two = (
             kind(make_env(ArmEnv, num_envs=2), make_noisy(make_env(ArmEnv)), **SETTINGS)
-            for _ in range(2)
+            for kind in pair
         )
         next(iter(one))
         two.load_state_dict(one.state_dict())
@@ -283,6 +285,16 @@ def test_environments_without_a_state_begin_anew(make):
     finally:
         one.shutdown()
         two.shutdown()
+
+
+def test_the_state_can_be_sent_by_a_worker():
+    """As a TensorDict, which takes tensors only."""
+    env = make_training_env(2)
+    collector = ResumableCollector(env, make_noisy(env), **SETTINGS)
+    next(iter(collector))
+    sent = TensorDict(collector.state_dict())
+    assert torch.equal(sent["torch_generator"], torch.get_rng_state())
+    collector.shutdown()
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -18,19 +18,17 @@ class ResumableCollector(Collector):
     The state of :class:`~torchrl.collectors.Collector` holds policy, transforms and counters:
     one that is loaded starts all episodes anew. This one also holds the simulator's state, the
     last observations with the running sums of :class:`~torchrl.envs.RewardSum` and all else that
-    is carried from step to step, and the state of the global generators, from torch's of which the
-    policy draws.
-    A collector that is loaded between two batches then collects what the saved one would have
-    collected, bit for bit. It takes an environment whose ``state_dict`` is complete, such as
-    :class:`~torchrl_safe.envs.ArmEnv`, with any transforms around it, in this process or, as the
-    ``collector_class`` of :class:`~torchrl.collectors.MultiSyncCollector`, in workers (the
-    trajectories may have other numbers there). Environments whose state has no
+    is carried from step to step, and the state of torch's generator on the CPU, which a policy
+    there draws from. A collector that is loaded between two batches then collects what the saved
+    one would have collected, bit for bit. It takes an environment whose ``state_dict`` is
+    complete, such as :class:`~torchrl_safe.envs.ArmEnv`, with any transforms around it, in this
+    process or, as the ``collector_class`` of :class:`~torchrl.collectors.MultiSyncCollector`, in
+    workers (the trajectories may have other numbers there). Environments whose state has no
     ``get_extra_state`` in it start their episodes anew.
 
     Arguments are those of :class:`~torchrl.collectors.Collector`.
 
     Examples:
-        >>> import torch
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.envs import RewardSum, TransformedEnv
         >>> from torchrl_safe.envs import ArmEnv
@@ -60,7 +58,8 @@ class ResumableCollector(Collector):
         if _is_complete(simulator):
             state["base_env_state_dict"] = simulator
             state["carrier"] = self._carrier.exclude("next").clone().to_dict()
-        state["generators"] = GlobalRNGState().state_dict()
+        # Tensors only: workers send their state as a TensorDict.
+        state["torch_generator"] = torch.get_rng_state()
         return state
 
     def load_state_dict(self, state_dict: OrderedDict, **kwargs: Any) -> None:
@@ -75,8 +74,8 @@ class ResumableCollector(Collector):
                 batch_size=self._carrier.batch_size,
                 device=self._carrier.device,
             ).clone()
-        if "generators" in state_dict:
-            GlobalRNGState().load_state_dict(state_dict["generators"])
+        if "torch_generator" in state_dict:
+            torch.set_rng_state(state_dict["torch_generator"])
 
 
 def _is_complete(state: Mapping[str, Any]) -> bool:
