@@ -23,6 +23,7 @@ from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from experiments import train
+from experiments.agent import num_costs
 from experiments.evaluation import evaluate, summarize
 from experiments.policy import SavedPolicy, load_policy
 from experiments.report import figures_table, save_animation
@@ -109,7 +110,7 @@ def check_fit(env: EnvBase, saved: SavedPolicy, config: Config) -> None:
                 f"env must have {name} of width {getattr(saved.spec, name)}, which the policy was "
                 f"trained for, got {width}."
             )
-    costs = env.reward_spec["cost"].shape[-1]
+    costs = num_costs(env)
     if len(config.cost_limits or (1,)) != costs:
         raise ValueError(
             f"cost_limits must be one for each of the {costs} costs of env, got "
