@@ -152,7 +152,9 @@ class OnPolicy:
         learner = OnPolicyLearner(
             loss,
             agent.actor,
-            NoiseSchedule(agent.log_std, last=config.last_log_std, batches=batches),
+            NoiseSchedule(
+                agent.log_std, config.first_log_std, config.last_log_std, batches=batches
+            ),
             learning_rate=config.learning_rate,
             batches=batches,
             epochs=self.epochs or config.epochs,

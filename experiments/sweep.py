@@ -42,6 +42,12 @@ class Config:
     """Runs for each limit, with seeds from 0."""
     frames: int = train.Config.frames
     """Control steps to train for."""
+    episode_steps: int | None = train.Config.episode_steps
+    """Control steps after which an episode to learn from is cut off."""
+    first_log_std: float = train.Config.first_log_std
+    """Logarithm of the policy's standard deviation at the start."""
+    last_log_std: float = train.Config.last_log_std
+    """The same at the end."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
     workers: int = os.cpu_count() or 1
@@ -61,6 +67,9 @@ def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]
                 cost_limit=limit or 0.0,
                 seed=seed,
                 frames=config.frames,
+                episode_steps=config.episode_steps,
+                first_log_std=config.first_log_std,
+                last_log_std=config.last_log_std,
                 eval_episodes=config.eval_episodes,
                 workers=1,
                 out=config.out / "runs" / _name(action, limit, seed),

@@ -141,9 +141,13 @@ class Config:
     learning_rate: float = 5e-4
     """Adam's learning rate of the policy at the start, half that of the critics; both fall
     linearly to 0. Off policy all networks have twice as much, and keep it."""
+    episode_steps: int | None = None
+    """Control steps after which an episode to learn from is cut off, if not at the limit of the
+    environment; evaluations always play to that."""
+    first_log_std: float = 0.0
+    """Logarithm of the policy's standard deviation at the start, before the squashing."""
     last_log_std: float = -1.5
-    """Logarithm of the policy's standard deviation at the end, before the squashing; it starts at
-    0 and falls linearly."""
+    """The same at the end; it moves from one to the other linearly."""
     gamma: float = 0.97
     """Discount of reward and cost."""
     multiplier_rule: MultiplierRule = "dual-ascent"
@@ -163,6 +167,11 @@ class Config:
         for name in (*counts, "minibatch", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.episode_steps is not None and self.episode_steps < 1:
+            raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps}.")
+        for name in ("first_log_std", "last_log_std"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be finite, got {getattr(self, name)}.")
         for name in ("learning_rate", "multiplier_rate"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
@@ -212,6 +221,8 @@ def make_env(
         "seed": seed,
         "gui": gui,
     }
+    if training and config.episode_steps is not None:
+        settings["max_episode_steps"] = config.episode_steps
     if config.paper:
         env = paper_env(PAPER_ACTIONS[config.action], **settings)
     else:

@@ -183,6 +183,14 @@ def test_what_ends_an_episode_early_ends_none_that_is_evaluated():
         env.close()
 
 
+def test_episodes_are_cut_off_where_they_are_learnt_from_only():
+    config = Config(paper=True, episode_steps=7)
+    for training, steps in ((True, 7), (False, 500)):
+        env = make_env(config, num_envs=1, training=training)
+        assert env.base_env.max_episode_steps == steps
+        env.close()
+
+
 def test_a_fixed_multiplier_stays():
     training = make_training(multiplier_rule="fixed", multiplier_init=2.0)
     assert training.updater is None
@@ -192,17 +200,18 @@ def test_a_fixed_multiplier_stays():
 
 def test_noise_falls_from_batch_to_batch():
     log_std = torch.nn.Parameter(torch.zeros(2))
-    schedule = NoiseSchedule(log_std, last=-2.0, batches=4)
+    schedule = NoiseSchedule(log_std, 0.5, -1.5, batches=4)
+    assert log_std.tolist() == [0.5, 0.5]
     seen = []
     for _ in range(2):
         schedule.step()
         seen.append(log_std.tolist())
-    resumed = NoiseSchedule(log_std, last=-2.0, batches=4)
+    resumed = NoiseSchedule(log_std, 0.5, -1.5, batches=4)
     resumed.load_state_dict(schedule.state_dict())
     for _ in range(2):
         resumed.step()
         seen.append(log_std.tolist())
-    assert seen == [[-0.5, -0.5], [-1.0, -1.0], [-1.5, -1.5], [-2.0, -2.0]]
+    assert seen == [[0.0, 0.0], [-0.5, -0.5], [-1.0, -1.0], [-1.5, -1.5]]
     assert not log_std.requires_grad
 
 
@@ -211,6 +220,9 @@ def test_noise_falls_from_batch_to_batch():
     [
         ({"frames": 0}, "frames must be at least 1, got 0"),
         ({"workers": 0}, "workers must be at least 1, got 0"),
+        ({"episode_steps": 0}, "episode_steps must be at least 1, got 0"),
+        ({"first_log_std": float("nan")}, "first_log_std must be finite, got nan"),
+        ({"last_log_std": float("-inf")}, "last_log_std must be finite, got -inf"),
         ({"envs": 5, "workers": 2}, "envs must be a multiple of workers, got 5 and 2"),
         ({"envs": 6, "workers": 2}, "frames_per_batch must be a multiple of envs"),
         ({"pessimism": -1.0}, "pessimism must not be negative, got -1.0"),
