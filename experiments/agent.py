@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import (
     AddStateIndependentNormalScale,
     NormalParamExtractor,
@@ -100,7 +102,7 @@ def make_actor(
     )
 
 
-def make_agent(env: EnvBase, *, gamma: float) -> Agent:
+def make_agent(env: EnvBase, *, gamma: float, log_std: float = 0.0) -> Agent:
     """Makes a policy and two critics of the state, with one output for each cost.
 
     Observations are standardized by what random actions bring about, and the critics predict
@@ -111,8 +113,9 @@ def make_agent(env: EnvBase, *, gamma: float) -> Agent:
     Args:
         env: environment to read widths from, and to play in.
         gamma: discount of reward and costs.
+        log_std: logarithm of the policy's deviation to start with.
     """
-    loc, scale = _standardization(env)
+    loc, scale = _standardization(env, deviation=math.exp(log_std))
     spec = _actor_spec(env, noise="same")
 
     def critic(outputs: int, out_key: str) -> ValueOperator:
@@ -123,9 +126,10 @@ def make_agent(env: EnvBase, *, gamma: float) -> Agent:
         return ValueOperator(predict, in_keys=["observation"], out_keys=[out_key])
 
     actor = make_actor(spec, loc, scale)
-    log_std = actor.get_parameter("0.module.1.state_independent_scale")
+    parameter = actor.get_parameter("0.module.1.state_independent_scale")
+    torch.nn.init.constant_(parameter, log_std)
     critics = critic(1, "state_value"), critic(num_costs(env), "cost_value")
-    return Agent(actor, *critics, log_std, spec)
+    return Agent(actor, *critics, parameter, spec)
 
 
 def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
@@ -174,10 +178,20 @@ def num_costs(env: EnvBase) -> int:
     return env.reward_spec["cost"].shape[-1]
 
 
-def _standardization(env: EnvBase) -> tuple[Tensor, Tensor]:
-    """Shift and scale that give what random actions bring about mean 0 and deviation 1."""
+def _standardization(env: EnvBase, *, deviation: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Shift and scale that give what random actions bring about mean 0 and deviation 1.
+
+    Actions without bounds are as far from 0 as those of a policy of that deviation.
+    """
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        env.rand_action(tensordict)
+        if isinstance(env.action_spec, Unbounded):
+            tensordict["action"] *= deviation
+        return tensordict
+
     with torch.no_grad():
-        seen = env.rollout(200, break_when_any_done=False)["observation"].flatten(0, -2)
+        seen = env.rollout(200, act, break_when_any_done=False)["observation"].flatten(0, -2)
     # What hardly moves in these steps may do so later.
     scale = 1 / seen.std(0).clamp_min(0.05)
     return -seen.mean(0) * scale, scale

@@ -138,7 +138,7 @@ class OnPolicy:
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
-        agent = make_agent(env, gamma=config.gamma)
+        agent = make_agent(env, gamma=config.gamma, log_std=config.first_log_std)
         loss = self.loss(agent.actor, agent.critic, agent.cost_critic, num_costs=num_costs(env))
         discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
         loss.make_value_estimator(ValueEstimators.GAE, **discount)
@@ -152,9 +152,7 @@ class OnPolicy:
         learner = OnPolicyLearner(
             loss,
             agent.actor,
-            NoiseSchedule(
-                agent.log_std, config.first_log_std, config.last_log_std, batches=batches
-            ),
+            NoiseSchedule(agent.log_std, last=config.last_log_std, batches=batches),
             learning_rate=config.learning_rate,
             batches=batches,
             epochs=self.epochs or config.epochs,

@@ -42,27 +42,23 @@ class NoiseSchedule:
 
     Args:
         log_std: logarithm of the standard deviation; changed in place.
-        first: its value in the first batch.
         last: its value after all batches.
         batches: how many batches there will be.
     """
 
-    def __init__(
-        self, log_std: torch.nn.Parameter, first: float, last: float, *, batches: int
-    ) -> None:
-        self.log_std, self.batches = log_std.requires_grad_(False), batches
-        self.first, self.last, self.steps = torch.tensor(first), torch.tensor(last), 0
-        self.log_std.fill_(first)
+    def __init__(self, log_std: torch.nn.Parameter, *, last: float, batches: int) -> None:
+        self.log_std, self.last, self.batches = log_std.requires_grad_(False), last, batches
+        self.first, self.steps = log_std.clone(), 0
 
     def step(self) -> None:
         self.steps += 1
-        self.log_std.copy_(self.first.lerp(self.last, self.steps / self.batches))
+        self.log_std.copy_(self.first.lerp(torch.tensor(self.last), self.steps / self.batches))
 
     def state_dict(self) -> dict[str, Any]:
-        return {"steps": self.steps}
+        return {"first": self.first, "steps": self.steps}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.steps = state_dict["steps"]
+        self.first, self.steps = state_dict["first"], state_dict["steps"]
 
 
 class OnPolicyLearner:

@@ -1,6 +1,7 @@
 """The main job, made small: what it leaves behind, and what it refuses."""
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -147,6 +148,23 @@ def test_agent_knows_the_scale_of_what_it_sees_and_predicts():
     assert type(agent.actor.get_dist(seen)).__name__ == "IndependentNormal"
 
 
+def test_agent_knows_how_far_its_own_noise_goes():
+    """Without bounds, twice the noise shows twice the range; with bounds all of it is seen."""
+
+    def ranges(paper, log_std):
+        torch.manual_seed(0)
+        env = make_env(Config(paper=paper, action="joint"), num_envs=4, seed=0)
+        agent = make_agent(env, gamma=0.99, log_std=log_std)
+        env.close()
+        assert agent.log_std.tolist() == [pytest.approx(log_std)] * 7
+        return 1 / agent.actor.get_submodule("0.module.0.0").scale[:7]
+
+    assert torch.equal(ranges(False, 0.0), ranges(False, 1.0))
+    wider = ranges(True, 1.0 + math.log(2)) / ranges(True, 1.0)
+    # Not quite: motors lag behind.
+    assert 1.5 < wider.mean() < 2.1
+
+
 def test_every_algorithm_has_a_name():
     assert set(ALGORITHMS) == set(get_args(AlgorithmName))
 
@@ -200,18 +218,17 @@ def test_a_fixed_multiplier_stays():
 
 def test_noise_falls_from_batch_to_batch():
     log_std = torch.nn.Parameter(torch.zeros(2))
-    schedule = NoiseSchedule(log_std, 0.5, -1.5, batches=4)
-    assert log_std.tolist() == [0.5, 0.5]
+    schedule = NoiseSchedule(log_std, last=-2.0, batches=4)
     seen = []
     for _ in range(2):
         schedule.step()
         seen.append(log_std.tolist())
-    resumed = NoiseSchedule(log_std, 0.5, -1.5, batches=4)
+    resumed = NoiseSchedule(log_std, last=-2.0, batches=4)
     resumed.load_state_dict(schedule.state_dict())
     for _ in range(2):
         resumed.step()
         seen.append(log_std.tolist())
-    assert seen == [[0.0, 0.0], [-0.5, -0.5], [-1.0, -1.0], [-1.5, -1.5]]
+    assert seen == [[-0.5, -0.5], [-1.0, -1.0], [-1.5, -1.5], [-2.0, -2.0]]
     assert not log_std.requires_grad
 
 
