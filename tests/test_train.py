@@ -161,7 +161,6 @@ def test_agent_knows_how_far_its_own_noise_goes():
 
     assert torch.equal(ranges(False, 0.0), ranges(False, 1.0))
     wider = ranges(True, 1.0 + math.log(2)) / ranges(True, 1.0)
-    # Not quite: motors lag behind.
     assert 1.5 < wider.mean() < 2.1
 
 
