@@ -46,8 +46,6 @@ class Config:
     """Control steps after which an episode to learn from is cut off."""
     first_log_std: float = train.Config.first_log_std
     """Logarithm of the policy's standard deviation at the start."""
-    last_log_std: float = train.Config.last_log_std
-    """The same at the end."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
     workers: int = os.cpu_count() or 1
@@ -69,7 +67,6 @@ def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]
                 frames=config.frames,
                 episode_steps=config.episode_steps,
                 first_log_std=config.first_log_std,
-                last_log_std=config.last_log_std,
                 eval_episodes=config.eval_episodes,
                 workers=1,
                 out=config.out / "runs" / _name(action, limit, seed),

@@ -124,7 +124,8 @@ def test_parallel_environment_whose_worker_dies(code):
         os.kill(workers[1].pid, signal.SIGKILL)
     with pytest.raises(RuntimeError, match="worker 1"):
         env.rollout(30, break_when_any_done=False)
-    with pytest.raises(RuntimeError, match=rf"worker 1 \(exit code {code}\)"):
+    # On a busy machine TorchRL terminates the other worker too, and names that one.
+    with pytest.raises(RuntimeError, match=rf"worker (1 \(exit code {code}\)|0 \(exit code -15\))"):
         env.close()
     assert all_gone(workers)
 
