@@ -73,7 +73,10 @@ class QAgent(NamedTuple):
 
 
 def make_actor(
-    spec: ActorSpec, loc: Tensor | None = None, scale: Tensor | None = None
+    spec: ActorSpec,
+    loc: Tensor | None = None,
+    scale: Tensor | None = None,
+    log_std: float = 0.0,
 ) -> TensorDictModuleBase:
     """Makes a policy.
 
@@ -81,6 +84,7 @@ def make_actor(
         spec: its shape.
         loc: what is added to observations, shape ``(observations,)``; by default nothing.
         scale: what they are multiplied by before that, the same; by default 1.
+        log_std: logarithm of a deviation that is the same in every state.
     """
     loc = torch.zeros(spec.observations) if loc is None else loc
     scale = torch.ones(spec.observations) if scale is None else scale
@@ -92,7 +96,8 @@ def make_actor(
     if spec.noise == "chosen":
         policy = torch.nn.Sequential(net, NormalParamExtractor())
     else:
-        policy = torch.nn.Sequential(net, AddStateIndependentNormalScale(spec.actions))
+        noise = AddStateIndependentNormalScale(spec.actions, init_value=log_std)
+        policy = torch.nn.Sequential(net, noise)
     return ProbabilisticActor(
         TensorDictModule(policy, ["observation"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -125,9 +130,8 @@ def make_agent(env: EnvBase, *, gamma: float, log_std: float = 0.0) -> Agent:
         )
         return ValueOperator(predict, in_keys=["observation"], out_keys=[out_key])
 
-    actor = make_actor(spec, loc, scale)
+    actor = make_actor(spec, loc, scale, log_std)
     parameter = actor.get_parameter("0.module.1.state_independent_scale")
-    torch.nn.init.constant_(parameter, log_std)
     critics = critic(1, "state_value"), critic(num_costs(env), "cost_value")
     return Agent(actor, *critics, parameter, spec)
 

@@ -164,11 +164,10 @@ class Config:
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs")
-        for name in (*counts, "minibatch", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        if self.episode_steps is not None and self.episode_steps < 1:
-            raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps}.")
+        for name in (*counts, "minibatch", "checkpoint_every", "episode_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}.")
         for name in ("first_log_std", "last_log_std"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)}.")

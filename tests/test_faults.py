@@ -111,21 +111,22 @@ def test_collector_whose_worker_hangs(fork, monkeypatch):
     assert all_gone(processes)
 
 
-def parallel(*envs):
-    return ParallelEnv(len(envs), list(envs), mp_start_method="fork", shutdown_timeout=0.5)
+def parallel(*envs, shutdown_timeout=0.5):
+    settings = {"mp_start_method": "fork", "shutdown_timeout": shutdown_timeout}
+    return ParallelEnv(len(envs), list(envs), **settings)
 
 
 @pytest.mark.parametrize("code", [-9, 1], ids=["killed", "raises"])
 def test_parallel_environment_whose_worker_dies(code):
-    env = parallel(arm, partial(arm, Fails(calls=10)) if code == 1 else arm)
+    # Time for the other worker to end by itself; TorchRL terminates, and names, one that does not.
+    env = parallel(arm, partial(arm, Fails(calls=10)) if code == 1 else arm, shutdown_timeout=10)
     env.reset()
     workers = list(env._workers)
     if code == -9:
         os.kill(workers[1].pid, signal.SIGKILL)
     with pytest.raises(RuntimeError, match="worker 1"):
         env.rollout(30, break_when_any_done=False)
-    # On a busy machine TorchRL terminates the other worker too, and names that one.
-    with pytest.raises(RuntimeError, match=rf"worker (1 \(exit code {code}\)|0 \(exit code -15\))"):
+    with pytest.raises(RuntimeError, match=rf"worker 1 \(exit code {code}\)"):
         env.close()
     assert all_gone(workers)
 
