@@ -62,6 +62,22 @@ def test_without_checkpoints_nothing_is_loaded(run, net):
     assert list(run.folder.iterdir()) == [notes], "only checkpoints are removed"
 
 
+def test_tensors_can_be_put_elsewhere(run, net):
+    save(run, net, 3)
+    assert run.load(map_location="cpu") == 3
+    assert net.weight.unique().tolist() == [3]
+    # It reaches torch.load: nothing can be copied from the meta device.
+    with pytest.raises(CheckpointError, match="meta"):
+        run.load(map_location="meta")
+
+
+def test_a_folder_that_cannot_be_made(tmp_path, net):
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(OSError, match=r"file.checkpoints"):
+        RunCheckpoints(file / "checkpoints", {"net": net}).save(1)
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[:-100])
 

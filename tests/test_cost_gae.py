@@ -192,6 +192,22 @@ def test_group_key_is_refused():
         make_gae(group_key="task")
 
 
+@pytest.mark.parametrize("name", ["gamma", "lmbda"])
+@pytest.mark.parametrize("value", [1.5, -0.1, float("nan"), torch.tensor([0.9, 0.9])], ids=str)
+def test_discounts_out_of_range_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be a number from 0 to 1, got"):
+        CostGAE(**{"gamma": 0.9, "lmbda": 0.9, name: value}, value_network=None)
+
+
+def test_a_discount_of_zero_that_is_loaded():
+    """TorchRL's vectorized recursion fails there."""
+    without, loaded = make_gae(lmbda=0.0), make_gae()
+    loaded.load_state_dict(without.state_dict())
+    batch = with_values(2)
+    expected = without(batch.clone())["cost_advantage"]
+    assert torch.equal(loaded(batch)["cost_advantage"], expected)
+
+
 def test_dispatch_equals_the_tensordict_call(num_costs):
     critic = make_critic("cost_value", num_costs)
     batch = make_batch(num_costs)

@@ -357,6 +357,38 @@ def test_the_entry_that_masks_is_that_of_the_wrapped_loss():
         torch.testing.assert_close(losses[key], expected[key])
 
 
+def test_coefficients_of_the_wrapped_loss_can_be_scheduled():
+    loss = wrap(ClipPPOLoss)
+    data = loss.estimate_advantages(make_batch()).reshape(-1)
+    loss.clip_epsilon, loss.entropy_coeff, loss.cost_critic_coeff = 0.05, 0.5, 0.25
+    assert not {"clip_epsilon", "entropy_coeff"} & vars(loss).keys()
+    expected = wrap(partial(ClipPPOLoss, clip_epsilon=0.05, entropy_coeff=0.5))
+    expected.cost_critic_coeff = 0.25
+    losses, others = loss(data), expected(data)
+    for key in ("loss_objective", "loss_cost_critic", "clip_fraction"):
+        assert torch.equal(losses[key], others[key]), key
+    # Its entropy is estimated from samples.
+    assert loss.loss_module.entropy_coeff == 0.5
+
+
+def test_the_keys_are_a_view():
+    loss = wrap(ClipPPOLoss)
+    keys = copy.copy(loss.tensor_keys)
+    loss.tensor_keys.cost, loss.tensor_keys.reward = "contacts", "gain"
+    assert (keys.cost, keys.reward) == ("contacts", "gain")
+    assert loss.loss_module.tensor_keys.reward == "gain"
+
+
+def test_stateful_nets():
+    loss = wrap(ClipPPOLoss)
+    data = make_batch().reshape(-1)
+    expected = loss.loss_module.get_stateful_net("actor_network")
+    actual = loss.get_stateful_net("actor_network")
+    for name, parameter in expected.named_parameters():
+        assert torch.equal(actual.get_parameter(name), parameter)
+    assert torch.equal(actual(data.clone())["loc"], expected(data.clone())["loc"])
+
+
 def test_recurrent_critics_see_whole_sequences_in_both_ways():
     """As they do in a call of the loss, around which TorchRL says so."""
     modes = []

@@ -251,6 +251,14 @@ def test_a_cost_that_is_not_finite_is_refused(adam, bad):
     assert_unchanged(adam, before)
 
 
+def test_a_cost_that_overflows_leaves_the_optimizer_as_it_was(adam):
+    """Adam's moments would be NaN for ever after."""
+    before = snapshot(adam)
+    with pytest.raises(ValueError, match="episode_cost must have a mean"):
+        adam.step(torch.full((2, 2), 2e38))
+    assert_unchanged(adam, before)
+
+
 @pytest.mark.parametrize(
     "shape", [(), (2,), (5, 1), (5, 3), (5, 2, 1), (0,)], ids=lambda shape: f"{shape}"
 )

@@ -346,6 +346,56 @@ def test_masked_steps_do_not_count():
         torch.testing.assert_close(losses[key], expected[key])
 
 
+@pytest.mark.parametrize("key", [("collector", "mask"), "mine"], ids=str)
+def test_advantages_are_those_of_the_steps_that_count(key):
+    """A padded row gives the others what they have without it, up to the rounding of sums."""
+    loss = make_loss(2)
+    if key == "mine":
+        loss.loss_mask_key = key
+    batch = make_batch(2)
+    expected = loss.estimate_advantages(batch[1:].clone())
+    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
+    mask[0] = False
+    batch[0] = batch[0].apply(torch.zeros_like)
+    batch[key] = mask
+    padded = loss.estimate_advantages(batch)
+    for name in ("cost_advantage", "cost_value_target", "value_target"):
+        torch.testing.assert_close(padded[name][1:], expected[name])
+    # Standardized, by the deviation that divides by the count.
+    kept = padded["advantage"][1:]
+    torch.testing.assert_close(kept.std(correction=0), torch.tensor(1.0))
+    ratio = (kept.numel() / (kept.numel() - 1)) ** 0.5
+    torch.testing.assert_close(kept, expected["advantage"] * ratio)
+    assert "shifted_valid" not in padded
+
+
+def test_one_advantage_without_the_other_is_refused():
+    loss = make_loss()
+    for key in ("advantage", "cost_advantage"):
+        data = estimated(loss)
+        del data[key]
+        with pytest.raises(KeyError, match=f"'{key}'.* only the other advantage"):
+            loss(data)
+
+
+def test_a_cost_critic_that_does_not_fit_is_refused():
+    """Also with targets given, and with the values of another critic in the data."""
+    actor, critic, _ = make_networks()
+    data = estimated(make_loss(2), 2)
+    narrow = PPOLagrangianLoss(actor, critic, make_critic("cost_value", 1), num_costs=2)
+    with pytest.raises(ValueError, match=r"'cost_value' must .* 2 costs .* \(24, 1\)"):
+        narrow(data)
+    astray = PPOLagrangianLoss(actor, critic, make_critic("state_value", 2), num_costs=2)
+    with pytest.raises(KeyError, match="'cost_value'"):
+        astray(data)
+
+
+def test_explained_variance_can_be_left_out():
+    loss = make_loss(log_explained_variance=False)
+    losses = loss(estimated(loss))
+    assert not any("explained_variance" in key for key in [*losses.keys(), *loss.out_keys])
+
+
 # ---------------------------------------------------------------- gradients
 
 

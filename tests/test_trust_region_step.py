@@ -29,6 +29,7 @@ from torchrl_safe.objectives import (
     PCPO,
     TRPO,
     DualAscent,
+    FOCOPSLoss,
     PIDControl,
     TrustRegionLoss,
     TrustRegionMethod,
@@ -540,11 +541,11 @@ def test_one_cost_and_a_cost_critic_are_asked_for(method):
         TrustRegionStep(PPOLoss(actor, critic), method)
 
 
-@pytest.mark.parametrize("loss_class", [ClipPPOLoss, KLPENPPOLoss])
+@pytest.mark.parametrize("loss_class", [ClipPPOLoss, KLPENPPOLoss, FOCOPSLoss])
 def test_clipped_and_penalized_surrogates_are_refused(loss_class):
-    actor, critic, _ = make_networks()
+    networks = make_networks()[: 3 if loss_class is FOCOPSLoss else 2]
     with pytest.raises(ValueError, match=rf"loss_module.*{loss_class.__name__}"):
-        TrustRegionStep(loss_class(actor, critic))
+        TrustRegionStep(loss_class(*networks))
 
 
 def test_other_bad_losses_are_refused():

@@ -103,8 +103,10 @@ def test_what_cannot_be_a_limit_or_a_loss_is_refused():
         (torch.ones(3, 1), r"episode_cost must have shape \(E, 2\), got \(3, 1\)"),
         (torch.ones(2), r"episode_cost must have shape \(E, 2\), got \(2,\)"),
         (torch.tensor([[1.0, float("nan")]]), "episode_cost must be finite"),
+        (torch.tensor([[2e38, 1.0], [2e38, 1.0]]), "episode_cost must have a mean"),
+        (torch.tensor([[1e300, 1.0]], dtype=torch.float64), "episode_cost must have a mean"),
     ],
-    ids=["width", "one-dimension", "nan"],
+    ids=["width", "one-dimension", "nan", "sum-too-large", "too-large"],
 )
 def test_costs_that_cannot_be_used_change_nothing(cost, message):
     loss, updater = make()

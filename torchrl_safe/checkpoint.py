@@ -96,6 +96,7 @@ class RunCheckpoints:
         metadata = {"settings": self.settings, **scores}
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
         unfinished = self.folder / _UNFINISHED
+        self.folder.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(unfinished, ignore_errors=True)  # Of a process that was killed.
         try:
             written = self._checkpoint.save(unfinished / path.name, metadata=metadata)
@@ -112,8 +113,13 @@ class RunCheckpoints:
         self._rotation.prune()
         return path
 
-    def load(self) -> int | None:
+    def load(self, *, map_location: Any = None) -> int | None:
         """Loads the newest checkpoint that can be used into all components.
+
+        Keyword Args:
+            map_location (optional): where :func:`torch.load` puts the tensors of the file, for
+                example ``"cpu"`` for a run that had another device than there is now. Defaults to
+                the device they were saved from.
 
         Returns:
             Its step, or None if there is no checkpoint.
@@ -125,7 +131,7 @@ class RunCheckpoints:
         refused = []
         for path in reversed(self._files()):
             try:
-                step = self._load(path)
+                step = self._load(path, map_location)
             except Exception as error:  # A torn file makes its readers stumble anywhere.
                 refused.append(f"{path}: {error}")
                 continue
@@ -151,7 +157,7 @@ class RunCheckpoints:
     def _files(self) -> list[Path]:
         return sorted(self.folder.glob("checkpoint-*.torchrl"))
 
-    def _load(self, path: Path) -> int:
+    def _load(self, path: Path, map_location: Any) -> int:
         manifest = Checkpoint.manifest(path)
         refuse_other_settings(manifest["metadata"].get("settings", {}), self.settings)
         for name, component in manifest["components"].items():
@@ -159,7 +165,7 @@ class RunCheckpoints:
                 raise CheckpointError(
                     f"component {name!r} is not what this class writes, but {component['files']}"
                 )
-        self._checkpoint.load(path)
+        self._checkpoint.load(path, map_location=map_location)
         return int(path.stem.removeprefix("checkpoint-"))
 
 

@@ -15,14 +15,14 @@ _LARGEST = torch.finfo(torch.float32).max
 _SMALLEST, _LARGE = 1e-18, 1e18
 
 
-def check_count(name: str, value: Any) -> None:
-    """Raises ValueError unless the value is a whole number of at least 1."""
+def check_count(name: str, value: Any, *, least: int = 1) -> None:
+    """Raises ValueError unless the value is a whole number, and not too small."""
     try:
-        usable = not isinstance(value, bool) and 1 <= operator.index(value) < 2**31
+        usable = not isinstance(value, bool) and least <= operator.index(value) < 2**31
     except TypeError:
         usable = False
     if not usable:
-        raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
 
 
 def check_number(name: str, value: Any, *, positive: bool = False) -> float:
@@ -35,6 +35,14 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
         raise ValueError(f"{name} must be positive, from 1e-18 to 1e18, got {value!r}.")
     if not 0 <= number <= _LARGEST:
         raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
+    return number
+
+
+def check_share(name: str, value: Any) -> float:
+    """Returns the value; raises ValueError unless it is a number from 0 to 1."""
+    number = as_number(value)
+    if not 0 <= number <= 1:
+        raise ValueError(f"{name} must be a number from 0 to 1, got {value!r}.")
     return number
 
 

@@ -17,7 +17,7 @@ from torchrl.objectives.utils import _clip_value_loss, _get_default_device, dist
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe.objectives._checks import check_count, check_number
-from torchrl_safe.objectives.cost_gae import CostGAE
+from torchrl_safe.objectives.cost_gae import CostGAE, centred
 
 Self = TypeVar("Self", bound="CostCriticMixin")
 
@@ -38,9 +38,11 @@ class CostCriticMixin(LossModule):
     It stands before a TorchRL loss among the bases, whose constructor gets all arguments but
     ``cost_critic_network``, ``num_costs`` and ``cost_critic_coeff``. The final class declares
     ``_AcceptedKeys(CostKeys, Parent._AcceptedKeys)`` and ``default_keys``. Of the parent are
-    read ``actor_network``, ``functional``, ``separate_losses``, ``clip_value`` and
-    ``loss_critic_type``.
+    read ``actor_network``, ``functional``, ``separate_losses``, ``clip_value``,
+    ``loss_critic_type`` and, where it has that option, ``log_explained_variance``.
     """
+
+    log_explained_variance = True
 
     _schedulable_buffers = frozenset({"cost_critic_coeff"})
 
@@ -132,7 +134,8 @@ class CostCriticMixin(LossModule):
         """Writes advantages and value targets of reward and costs, for a whole batch.
 
         The reward advantage is standardized to mean 0 and standard deviation 1, the cost
-        advantages are centred only, all over the whole batch.
+        advantages are centred only, all over the whole batch. Steps that the loss leaves out, as
+        those that pad a trajectory (``("collector", "mask")``), do not count.
 
         Args:
             tensordict (TensorDictBase): a batch as collectors return it, shape ``(*B, T)``.
@@ -148,9 +151,19 @@ class CostCriticMixin(LossModule):
             self._estimate_advantage(tensordict)
             advantage = tensordict.get(self.tensor_keys.advantage)
             if advantage.numel() > 1:
-                advantage = self._standardize_advantage(advantage, tensordict)
+                # Where TorchRL's looks for what counts.
+                counted = tensordict.select()
+                if (mask := self._mask(tensordict, advantage)) is not None:
+                    counted.set("shifted_valid", mask)
+                advantage = self._standardize_advantage(advantage, counted)
             tensordict.set(self.tensor_keys.advantage, advantage)
             return self._estimate_cost_advantage(tensordict)
+
+    def _mask(self, tensordict: TensorDictBase, values: Tensor) -> Tensor | None:
+        """The steps that the loss counts, expanded to the values, or None if all."""
+        found = (tensordict.get(key, None) for key in self._loss_mask_keys())
+        masks = [self._expand_loss_mask(mask, values) for mask in found if mask is not None]
+        return torch.stack(masks).all(0) if masks else None
 
     def _estimate_advantage(self, tensordict: TensorDictBase) -> None:
         self.value_estimator(
@@ -160,13 +173,18 @@ class CostCriticMixin(LossModule):
         )
 
     def _estimate_cost_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
-        key = unravel_key(("next", self.tensor_keys.cost))
+        key, estimator = unravel_key(("next", self.tensor_keys.cost)), self.cost_value_estimator
         self._check_width(key, get_or_raise(tensordict, key))
-        return self.cost_value_estimator(
+        tensordict = estimator(
             tensordict,
             params=self.cost_critic_network_params.detach() if self.functional else None,
             target_params=self.target_cost_critic_network_params,
         )
+        advantage = tensordict.get(self.tensor_keys.cost_advantage)
+        mask = self._mask(tensordict, advantage)
+        if mask is not None and isinstance(estimator, CostGAE) and estimator.average_gae:
+            tensordict.set(self.tensor_keys.cost_advantage, centred(advantage, mask))
+        return tensordict
 
     def _check_width(self, key: NestedKey, values: Tensor) -> None:
         if values.shape[-1] != self.num_costs:
@@ -175,7 +193,9 @@ class CostCriticMixin(LossModule):
                 f"num_costs, got shape {tuple(values.shape)}."
             )
 
-    def loss_cost_critic(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor | None, Tensor]:
+    def loss_cost_critic(
+        self, tensordict: TensorDictBase
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Loss of the cost critic, summed over the costs.
 
         Args:
@@ -184,7 +204,8 @@ class CostCriticMixin(LossModule):
 
         Returns:
             The loss times ``cost_critic_coeff``, shape ``(*B, 1)``; the clipped fraction of the
-            values (``None`` without ``clip_value``); the explained variance, shape ``(k,)``.
+            values (``None`` without ``clip_value``); the explained variance, shape ``(k,)``
+            (``None`` without ``log_explained_variance``).
         """
         if self.separate_losses:
             tensordict = tensordict.detach()
@@ -201,17 +222,22 @@ class CostCriticMixin(LossModule):
             if self.functional
             else contextlib.nullcontext()
         ):
-            value = self.cost_critic_network(tensordict).get(self.tensor_keys.cost_value)
+            # Of what it reads alone: a value that the data hold is not what it writes.
+            data = tensordict.select(*self._cost_critic_in_keys, strict=False)
+            value = get_or_raise(self.cost_critic_network(data), self.tensor_keys.cost_value)
+        self._check_width(self.tensor_keys.cost_value, value)
         loss = distance_loss(target, value, loss_function=self.loss_critic_type)
         clip_fraction = None
         if old_value is not None:
             loss, clip_fraction = _clip_value_loss(
                 old_value, value, self.clip_value, target, loss, self.loss_critic_type
             )
-        with torch.no_grad():
-            flat_target, flat_error = target.flatten(0, -2), (target - value).flatten(0, -2)
-            total = flat_target.var(0, correction=0) + torch.finfo(target.dtype).eps
-            explained_variance = 1 - flat_error.var(0, correction=0) / total
+        explained_variance = None
+        if self.log_explained_variance:
+            with torch.no_grad():
+                flat_target, flat_error = target.flatten(0, -2), (target - value).flatten(0, -2)
+                total = flat_target.var(0, correction=0) + torch.finfo(target.dtype).eps
+                explained_variance = 1 - flat_error.var(0, correction=0) / total
         # Summed, not averaged: each critic column then learns as fast with k costs as with one.
         loss = self.cost_critic_coeff * loss.sum(-1, keepdim=True)
         return loss, clip_fraction, explained_variance
@@ -219,7 +245,7 @@ class CostCriticMixin(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = tensordict.clone(False)
-        if tensordict.get(self.tensor_keys.cost_advantage, None) is None:
+        if not self._has_advantages(tensordict):
             self._estimate_cost_advantage(tensordict)
         losses = super().forward(tensordict)
         self._set_cost_outputs(losses, tensordict)
@@ -231,17 +257,33 @@ class CostCriticMixin(LossModule):
         )
         return losses
 
+    def _has_advantages(self, tensordict: TensorDictBase) -> bool:
+        """Whether both are there. One alone would be joined by one of shuffled steps."""
+        keys = (self.tensor_keys.advantage, self.tensor_keys.cost_advantage)
+        missing = [key for key in keys if tensordict.get(key, None) is None]
+        if len(missing) == 1:
+            raise KeyError(
+                f"The key {missing[0]!r} was not found in the input tensordict, which has only the "
+                "other advantage: call estimate_advantages on the whole batch."
+            )
+        return not missing
+
     def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
         """Adds to the parent's outputs; a loss with more of them extends this and the next."""
         loss, clip_fraction, explained_variance = self.loss_cost_critic(tensordict)
         losses.set("loss_cost_critic", self._reduce_loss(loss, tensordict).squeeze(-1))
-        losses.set("cost_explained_variance", explained_variance.mean())
+        if explained_variance is not None:
+            losses.set("cost_explained_variance", explained_variance.mean())
         if clip_fraction is not None:
             losses.set("cost_value_clip_fraction", clip_fraction)
 
     def _cost_out_keys(self) -> list[NestedKey]:
-        keys: list[NestedKey] = ["loss_cost_critic", "cost_explained_variance"]
-        return [*keys, "cost_value_clip_fraction"] if self.clip_value else keys
+        keys: list[NestedKey] = ["loss_cost_critic"]
+        if self.log_explained_variance:
+            keys.append("cost_explained_variance")
+        if self.clip_value:
+            keys.append("cost_value_clip_fraction")
+        return keys
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()

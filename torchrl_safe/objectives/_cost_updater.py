@@ -73,20 +73,24 @@ class CostUpdater(abc.ABC):
             raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
         if not len(episode_cost):
             return
-        self._move(buffer, self._violation(episode_cost.to(buffer)))
-
-    def _violation(self, episode_cost: Tensor) -> Tensor:
-        return self._pessimistic_cost(episode_cost) - self.cost_limit.to(episode_cost)
-
-    def _pessimistic_cost(self, episode_cost: Tensor) -> Tensor:
-        mean = episode_cost.mean(0)
-        if len(episode_cost) == 1:  # It has no standard error.
-            return mean
-        return mean + self.pessimism * episode_cost.std(0) / len(episode_cost) ** 0.5
+        self._move(buffer, episode_cost.to(buffer))
 
     @abc.abstractmethod
-    def _move(self, buffer: Tensor, violation: Tensor) -> None:
-        """Writes the buffer in place; ``violation`` is that of :meth:`_violation`, ``(k,)``."""
+    def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
+        """Writes the buffer in place, or raises before anything has changed."""
+
+    def _violation(self, episode_cost: Tensor) -> Tensor:
+        """How far the costs are above their limits, shape ``(k,)``."""
+        cost = episode_cost.mean(0)
+        if len(episode_cost) > 1:  # One alone has no standard error.
+            cost = cost + self.pessimism * episode_cost.std(0) / len(episode_cost) ** 0.5
+        violation = cost - self.cost_limit.to(cost)
+        if not violation.isfinite().all():
+            raise ValueError(
+                f"episode_cost must have a mean and deviation within {violation.dtype}, got "
+                f"{episode_cost}."
+            )
+        return violation
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the updater; the buffer is in the state of the loss."""

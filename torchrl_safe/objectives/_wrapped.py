@@ -26,7 +26,8 @@ class WrappedLoss(LossModule):
     """Holds an advantage loss and gives it the advantage that :meth:`_mix` makes.
 
     It stands behind a :class:`CostCriticMixin` among the bases, in the place of a parent. Keys,
-    options and networks are those of the loss that it holds, and are set here.
+    options and networks are those of the loss that it holds, and are set here. Target networks are
+    in the loss that it holds: ``SoftUpdate(loss.loss_module)``.
     """
 
     # Whole-batch standardization as PPO has it, for losses that have none.
@@ -54,6 +55,15 @@ class WrappedLoss(LossModule):
         mixed = self._mix(tensordict.get(key), tensordict.get(self.tensor_keys.cost_advantage))
         return self.loss_module(tensordict.clone(False).set(key, mixed))
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        # A coefficient of the wrapped loss, as schedules set it.
+        modules = self.__dict__.get("_modules", {})
+        inner = modules.get("loss_module")
+        if inner is not None and name in type(inner)._all_schedulable_buffers:
+            setattr(inner, name, value)
+        else:
+            super().__setattr__(name, value)
+
     @property
     def value_estimator(self) -> ValueEstimatorBase:
         """The value estimator of the reward."""
@@ -73,6 +83,11 @@ class WrappedLoss(LossModule):
     def actor_network(self) -> ProbabilisticTensorDictSequential:
         """The policy of the wrapped loss."""
         return self.loss_module.actor_network
+
+    @property
+    def actor_network_params(self) -> TensorDictParams:
+        """The parameters of the wrapped loss's policy."""
+        return self.loss_module.actor_network_params
 
     @property
     def critic_network(self) -> TensorDictModule:
@@ -158,10 +173,15 @@ class WrappedLoss(LossModule):
 class _BothKeys:
     # A view, so that it follows whoever sets a key.
     def __init__(self, costs: CostKeys, wrapped: Any) -> None:
-        self._costs, self._wrapped = costs, wrapped
+        self.__dict__.update(_costs=costs, _wrapped=wrapped)
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # Asked by copy of a view that has nothing yet.
+            raise AttributeError(name)
         return getattr(self._costs if name in _COST_KEYS else self._wrapped, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self._costs if name in _COST_KEYS else self._wrapped, name, value)
 
 
 def _check_wrapped(loss_module: LossModule) -> None:

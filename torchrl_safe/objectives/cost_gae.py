@@ -11,6 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
+from torchrl_safe.objectives._checks import check_share
+
 
 class CostGAE(GAE):
     r"""GAE of k costs, each with its own column, sharing one done signal.
@@ -27,8 +29,8 @@ class CostGAE(GAE):
     - ``vectorized`` defaults to ``True``.
 
     Keyword Args:
-        gamma (float): discount of the costs.
-        lmbda (float): trace decay of the costs.
+        gamma (float): discount of the costs, from 0 to 1.
+        lmbda (float): trace decay of the costs, from 0 to 1.
         value_network (TensorDictModule, optional): cost critic with k outputs. ``None`` expects
             ``"cost_value"`` and ``("next", "cost_value")`` in the data.
         average_gae (bool, optional): centre the advantages. Defaults to ``True``.
@@ -38,7 +40,8 @@ class CostGAE(GAE):
             excepted.
 
     Raises:
-        ValueError: if the cost and the value of a batch differ in shape.
+        ValueError: if ``gamma`` or ``lmbda`` is out of its range; in a call, if the cost and the
+            value of a batch differ in shape.
 
     Examples:
         >>> import torch
@@ -79,8 +82,8 @@ class CostGAE(GAE):
     def __init__(
         self,
         *,
-        gamma: float | Tensor,
-        lmbda: float | Tensor,
+        gamma: float,
+        lmbda: float,
         value_network: TensorDictModuleBase | None,
         average_gae: bool = True,
         vectorized: bool | None = True,
@@ -89,13 +92,22 @@ class CostGAE(GAE):
         if kwargs.get("group_key") is not None:
             raise ValueError("CostGAE centres over the whole batch: group_key is not supported.")
         super().__init__(
-            gamma=gamma,
-            lmbda=lmbda,
+            gamma=check_share("gamma", gamma),
+            lmbda=check_share("lmbda", lmbda),
             value_network=value_network,
             average_gae=average_gae,
-            vectorized=vectorized and bool(gamma * lmbda),
+            vectorized=vectorized,
             **kwargs,
         )
+
+    @property
+    def vectorized(self) -> bool:
+        # Asked for at each call: the state that is loaded may bring a discount of 0.
+        return bool(super().vectorized and self.gamma * self.lmbda)
+
+    @vectorized.setter
+    def vectorized(self, value: bool | None) -> None:
+        self._vectorized = value
 
     def _prepare_signals(
         self, reward: Tensor, done: Tensor, terminated: Tensor, value: Tensor
@@ -114,7 +126,13 @@ class CostGAE(GAE):
     def _normalize_advantage(
         self, adv: Tensor, valid: Tensor | None = None, groups: Tensor | None = None
     ) -> Tensor:
-        mask = torch.ones_like(adv) if valid is None else self._expand_to_match(valid, adv).to(adv)
-        batch_dims = tuple(range(adv.ndim - 1))
-        count = mask.sum(batch_dims, keepdim=True).clamp_min(1)
-        return adv - (adv * mask).sum(batch_dims, keepdim=True) / count
+        return centred(adv, None if valid is None else self._expand_to_match(valid, adv))
+
+
+def centred(values: Tensor, valid: Tensor | None) -> Tensor:
+    """Takes off the mean of each column, over the rows that are valid."""
+    rows = tuple(range(values.ndim - 1))
+    if valid is None:
+        return values - values.mean(rows, keepdim=True)
+    count = valid.sum(rows, keepdim=True).clamp_min(1)
+    return values - torch.where(valid, values, 0.0).sum(rows, keepdim=True) / count

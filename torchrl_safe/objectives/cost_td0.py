@@ -10,6 +10,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.value import TD0Estimator
 
+from torchrl_safe.objectives._checks import check_share
+
 
 class CostTD0(TD0Estimator):
     r"""TD(0) of k costs, each with its own column, sharing one done signal.
@@ -25,13 +27,14 @@ class CostTD0(TD0Estimator):
     "cost"]``, with one ``gamma`` for both), ``"steps_to_next_obs"`` gives the power of it.
 
     Keyword Args:
-        gamma (float): discount of the costs.
+        gamma (float): discount of the costs, from 0 to 1.
         value_network (TensorDictModule, optional): cost critic with k outputs. Defaults to
             ``None``, which expects ``("next", "state_action_cost_value")`` in the data.
         **kwargs: the other arguments of :class:`~torchrl.objectives.value.TD0Estimator`.
 
     Raises:
-        ValueError: if the cost and the value of a batch differ in shape.
+        ValueError: if ``gamma`` is out of its range; in a call, if the cost and the value of a
+            batch differ in shape.
 
     Examples:
         >>> import torch
@@ -63,8 +66,8 @@ class CostTD0(TD0Estimator):
 
     default_keys = _AcceptedKeys
 
-    def __init__(self, *, gamma: float | Tensor, value_network: Any = None, **kwargs: Any) -> None:
-        super().__init__(gamma=gamma, value_network=value_network, **kwargs)
+    def __init__(self, *, gamma: float, value_network: Any = None, **kwargs: Any) -> None:
+        super().__init__(gamma=check_share("gamma", gamma), value_network=value_network, **kwargs)
 
     def value_estimate(
         self,

@@ -81,7 +81,15 @@ class MultiplierUpdater(CostUpdater):
         # The largest so far, slowly forgotten.
         self.cost_scale = torch.zeros_like(self.cost_limit)
 
-    def _move(self, buffer: Tensor, violation: Tensor) -> None:
+    def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
+        violation, cost_scale = self._violation(episode_cost), self.cost_scale
+        if self.normalize:
+            current, past = self._scale_of(episode_cost), cost_scale.to(episode_cost)
+            # Not of this batch alone: one with few costs would count for more than one with many,
+            # and rare costs would exceed the limit on average.
+            scale = torch.maximum(current, past)
+            violation = torch.where(scale > 0, violation / scale, 0.0)
+            cost_scale = torch.maximum(current, past.lerp(current, 0.1))
         proposal = self.next_multiplier(buffer, violation)
         # A proposal of infinity is one beyond the bound, if there is one.
         projected = proposal.clamp(0, self.max_multiplier)
@@ -90,23 +98,7 @@ class MultiplierUpdater(CostUpdater):
                 f"next_multiplier must return {len(buffer)} finite numbers, got {proposal}."
             )
         buffer.copy_(projected)
-
-    @torch.no_grad()
-    def step(self, episode_cost: Tensor) -> None:
-        super().step(episode_cost)
-        if self.normalize and len(episode_cost):
-            current = self._scale_of(episode_cost.to(self.loss_module.lagrange_multiplier))
-            past = self.cost_scale.to(current)
-            self.cost_scale = torch.maximum(current, past.lerp(current, 0.1))
-
-    def _violation(self, episode_cost: Tensor) -> Tensor:
-        violation = super()._violation(episode_cost)
-        if not self.normalize:
-            return violation
-        # Not of this batch alone: one with few costs would count for more than one with many, and
-        # rare costs would exceed the limit on average.
-        scale = torch.maximum(self._scale_of(episode_cost), self.cost_scale.to(violation))
-        return torch.where(scale > 0, violation / scale, 0.0)
+        self.cost_scale = cost_scale
 
     def _scale_of(self, episode_cost: Tensor) -> Tensor:
         limit = self.cost_limit.to(episode_cost)
@@ -206,7 +198,7 @@ class DualAscent(MultiplierUpdater):
             pessimism=pessimism,
             normalize=normalize,
         )
-        check_number("lr", lr, positive=True)
+        lr = check_number("lr", lr, positive=True)
         multiplier = loss_module.lagrange_multiplier
         if not parametrization.inv(multiplier).isfinite().all():
             raise ValueError(

@@ -96,11 +96,12 @@ class PIDControl(MultiplierUpdater):
             pessimism=pessimism,
             normalize=normalize,
         )
-        for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)):
-            check_number(name, gain)
+        self.kp, self.ki, self.kd = (
+            check_number(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd))
+        )
         if not 0 <= as_number(smoothing) < 1:
             raise ValueError(f"smoothing must be at least 0 and less than 1, got {smoothing!r}.")
-        self.kp, self.ki, self.kd, self.smoothing = kp, ki, kd, smoothing
+        self.smoothing = as_number(smoothing)
         multiplier = loss_module.lagrange_multiplier
         self.integral = multiplier.clone()
         # NaN until there has been a batch.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -18,6 +20,7 @@ from torchrl_safe.objectives._actor import (
 )
 from torchrl_safe.objectives._checks import as_number, check_count, check_number
 from torchrl_safe.objectives._cost_critic import get_or_raise
+from torchrl_safe.objectives.focops import FOCOPSLoss
 from torchrl_safe.objectives.trust_region import (
     NotPositiveDefiniteError,
     backtracking_line_search,
@@ -32,6 +35,12 @@ from torchrl_safe.objectives.trust_region_methods import (
     TrustRegionProblem,
     TrustRegionSolution,
 )
+
+
+class _Evaluation(NamedTuple):
+    distribution: Distribution
+    loss: Tensor
+    cost: Tensor
 
 
 class TrustRegionStep:
@@ -124,28 +133,19 @@ class TrustRegionStep:
         max_backtracks: int = 10,
     ) -> None:
         _check_loss(loss_module, method)
-        check_number("max_kl", max_kl, positive=True)
         if episode_length is not None:
-            check_number("episode_length", episode_length, positive=True)
-        check_number("damping", damping)
+            episode_length = check_number("episode_length", episode_length, positive=True)
         check_count("cg_iterations", cg_iterations)
-        for name, value, allowed in (
-            ("shrink", shrink, 0 < as_number(shrink) < 1),
-            (
-                "max_backtracks",
-                max_backtracks,
-                isinstance(max_backtracks, int) and max_backtracks >= 0,
-            ),
-        ):
-            if not allowed:
-                raise ValueError(f"{name} is out of its range, got {value!r}.")
+        check_count("max_backtracks", max_backtracks, least=0)
+        if not 0 < as_number(shrink) < 1:
+            raise ValueError(f"shrink must be more than 0 and less than 1, got {shrink!r}.")
         self.loss_module = loss_module
         self.method = method
         self.episode_length = episode_length
-        self.max_kl = max_kl
-        self.damping = damping
+        self.max_kl = check_number("max_kl", max_kl, positive=True)
+        self.damping = check_number("damping", damping)
         self.cg_iterations = cg_iterations
-        self.shrink = shrink
+        self.shrink = as_number(shrink)
         self.max_backtracks = max_backtracks
         self.rejected_steps = 0
         self.indefinite_steps = 0
@@ -156,9 +156,8 @@ class TrustRegionStep:
 
         Args:
             tensordict (TensorDictBase): the whole batch, collected by the present actor, with
-                ``advantage`` and, for a constrained method, ``cost_advantage``, as
-                ``estimate_advantages`` writes them. Give the batch's episode costs to the updater
-                of the loss before.
+                the advantages and value targets that ``estimate_advantages`` writes. Give the
+                batch's episode costs to the updater of the loss before.
 
         Returns:
             Numbers to log, each of shape ``()``: ``kl``, ``surrogate_gain``,
@@ -177,12 +176,15 @@ class TrustRegionStep:
         if self.method.constrained:
             get_or_raise(tensordict, keys.cost_advantage)
         with torch.enable_grad(), set_recurrent_mode(True):
+            start = self._evaluate(tensordict)
+            with torch.no_grad():
+                fixed = actor_distribution(self.loss_module, tensordict)
             try:
-                problem = self._local_problem(tensordict)
+                problem = self._local_problem(tensordict, start, fixed)
             except NotPositiveDefiniteError:
                 self.indefinite_steps += 1
                 return self._report()
-            return self._search(tensordict, problem, self.method(problem))
+            return self._search(tensordict, start, fixed, problem, self.method(problem))
 
     def state_dict(self) -> dict[str, int]:
         """Returns the counts; the actor is in the state of the loss."""
@@ -204,17 +206,17 @@ class TrustRegionStep:
             raise ValueError("episode_length must be given if gamma of the costs is 1, got None.")
         return scale * loss.cost_violation.item()
 
-    def _local_problem(self, tensordict: TensorDictBase) -> TrustRegionProblem:
-        parameters = actor_parameters(self.loss_module)
-        gradient = -self._checked_gradient(self._surrogate_loss(tensordict), "reward")
+    def _local_problem(
+        self, tensordict: TensorDictBase, start: _Evaluation, fixed: Distribution
+    ) -> TrustRegionProblem:
+        gradient = -self._checked_gradient(start.loss, "reward")
         cost_gradient = torch.zeros_like(gradient)
         if self.method.constrained:
-            cost_gradient = self._checked_gradient(self._cost_surrogate(tensordict), "cost")
-        distribution = actor_distribution(self.loss_module, tensordict)
-        with torch.no_grad():
-            fixed = actor_distribution(self.loss_module, tensordict)
+            cost_gradient = self._checked_gradient(start.cost, "cost")
         product = fisher_vector_product(
-            self._mean_kl(fixed, distribution, tensordict), parameters, damping=self.damping
+            self._mean_kl(fixed, start.distribution, tensordict),
+            actor_parameters(self.loss_module),
+            damping=self.damping,
         )
         natural_gradient, natural_cost_gradient = (
             conjugate_gradient(product, vector, max_iterations=self.cg_iterations)
@@ -234,6 +236,8 @@ class TrustRegionStep:
     def _search(
         self,
         tensordict: TensorDictBase,
+        start: _Evaluation,
+        fixed: Distribution,
         problem: TrustRegionProblem,
         solution: TrustRegionSolution,
     ) -> TensorDict:
@@ -241,19 +245,14 @@ class TrustRegionStep:
             return self._report(constraint_active=solution.constraint_active)
         parameters = actor_parameters(self.loss_module)
         before = read_flat(parameters)
-        fixed = actor_distribution(self.loss_module, tensordict)
-        limited = self.method.constrained
-        old_loss = self._surrogate_loss(tensordict)
-        old_cost = self._cost_surrogate(tensordict) if limited else torch.zeros_like(old_loss)
         asks_gain = not solution.recovery and bool(problem.gradient @ solution.step > 0)
         measured: dict[str, Tensor] = {}
 
         def accepts(fraction: float) -> bool:
             write_flat(before + fraction * solution.step, parameters)
-            distribution = actor_distribution(self.loss_module, tensordict)
-            kl = self._mean_kl(fixed, distribution, tensordict)
-            gain = old_loss - self._surrogate_loss(tensordict)
-            rise = (self._cost_surrogate(tensordict) if limited else old_cost) - old_cost
+            trial = self._evaluate(tensordict)
+            kl = self._mean_kl(fixed, trial.distribution, tensordict)
+            gain, rise = start.loss - trial.loss, trial.cost - start.cost
             measured.update(kl=kl, surrogate_gain=gain, cost_surrogate_change=rise)
             return bool(
                 (kl <= self.max_kl)
@@ -277,12 +276,13 @@ class TrustRegionStep:
             **measured, step_fraction=fraction, constraint_active=solution.constraint_active
         )
 
-    def _surrogate_loss(self, tensordict: TensorDictBase) -> Tensor:
+    def _evaluate(self, tensordict: TensorDictBase) -> _Evaluation:
         losses = self.loss_module(tensordict)
-        return losses["loss_objective"] + losses.get("loss_entropy", 0.0)
-
-    def _cost_surrogate(self, tensordict: TensorDictBase) -> Tensor:
-        return self.loss_module.cost_surrogate_loss(tensordict).squeeze(0)
+        loss = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
+        cost = torch.zeros_like(loss)
+        if self.method.constrained:
+            cost = self.loss_module.cost_surrogate_loss(tensordict).squeeze(0)
+        return _Evaluation(actor_distribution(self.loss_module, tensordict), loss, cost)
 
     def _checked_gradient(self, surrogate: Tensor, name: str) -> Tensor:
         gradient = flat_gradient(surrogate, actor_parameters(self.loss_module))
@@ -312,7 +312,7 @@ _COUNTS = ("rejected_steps", "indefinite_steps", "recovery_steps")
 
 
 def _check_loss(loss: PPOLoss, method: TrustRegionMethod) -> None:
-    if not isinstance(loss, PPOLoss) or isinstance(loss, ClipPPOLoss | KLPENPPOLoss):
+    if not isinstance(loss, PPOLoss) or isinstance(loss, ClipPPOLoss | KLPENPPOLoss | FOCOPSLoss):
         raise ValueError(
             f"loss_module must be a PPOLoss without clipping or penalty, got {type(loss).__name__}."
         )

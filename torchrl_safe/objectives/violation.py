@@ -48,8 +48,8 @@ class ViolationUpdater(CostUpdater):
 
     buffer_name = "cost_violation"
 
-    def _move(self, buffer: Tensor, violation: Tensor) -> None:
-        buffer.copy_(violation)
+    def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
+        buffer.copy_(self._violation(episode_cost))
 
 
 class ViolationMixin(CostCriticMixin):
