@@ -17,30 +17,11 @@ from benchmarks.report import Figure
 from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.algorithms import ALGORITHMS
 from experiments.train import AlgorithmName, Config, collecting, make_env
-from torchrl_safe.envs import PAPER_JOINT, JointDelta, paper_env
+from torchrl_safe.envs import PAPER_JOINT, PAPER_SETTINGS, JointDelta
 from torchrl_safe.envs.gym import ArmGymEnv
 
 # Stable-Baselines3 refuses the paper's actions, which have no bound.
 _BOUNDED = replace(PAPER_JOINT, bound=1e3)
-
-
-class PaperGymEnv(ArmGymEnv):
-    """The Gymnasium view of the paper's environment."""
-
-    def __init__(self) -> None:
-        env = paper_env(_BOUNDED)
-        env.close()
-        super().__init__(
-            arm=env.arm,
-            action=env.action_mode,
-            task=env.task,
-            obstacles=env.obstacles,
-            costs=env.costs,
-            observation=env.observation,
-            frame_skip=env.frame_skip,
-            max_episode_steps=env.max_episode_steps,
-            scene=env.scene,
-        )
 
 
 @contextmanager
@@ -67,7 +48,8 @@ def ours(config: Config) -> Iterator[Contender]:
 @contextmanager
 def stable_baselines(config: Config, envs: int) -> Iterator[Contender]:
     """Stable-Baselines3's PPO with as many frames, minibatches and epochs."""
-    factory = PaperGymEnv if config.paper else partial(ArmGymEnv, action=JointDelta())
+    paper = {**PAPER_SETTINGS, "action": _BOUNDED}
+    factory = partial(ArmGymEnv, **(paper if config.paper else {"action": JointDelta()}))
     vector = DummyVecEnv([factory] * envs)
     model = PPO(
         "MlpPolicy",

@@ -42,8 +42,8 @@ class Config:
     """File that training has written: runs/.../policy.pt."""
     env: str | None = None
     """An environment of your own, as module:function. Called as function(num_envs=...), it
-    returns an ArmEnv, or any environment with reward and cost. Without it, the environment of the
-    training."""
+    returns an ArmEnv, or any environment with reward and cost. Without it, the environment that
+    make train trained in."""
     episodes: int = 256
     """Episodes to play at least, with the deterministic policy."""
     envs: int = 32
@@ -53,7 +53,7 @@ class Config:
     seed: int = 1_000_000
     """Seed of the episodes."""
     cost_limits: tuple[float, ...] = ()
-    """Limit of each cost of an episode; of a single cost by default that of the training."""
+    """Limit of each cost of an episode; by default those of the training."""
     gui: bool = False
     """Show some episodes in PyBullet's window, in real time. Needs a screen."""
     video: Path | None = None
@@ -78,6 +78,11 @@ class Config:
 def factory(config: Config, saved: SavedPolicy) -> Callable[..., EnvBase]:
     """Returns what makes the environment, called with ``num_envs``."""
     if config.env is None:
+        if "env" in saved.settings:
+            # Not called without being asked: a file may name any function.
+            raise ValueError(
+                f"env must be given for a policy that was trained in {saved.settings['env']}."
+            )
         known = {name: saved.settings[name] for name in _ENVIRONMENT}
         algorithm = saved.settings["name"]
         return partial(
@@ -98,6 +103,13 @@ def _with_sums(make_env: Callable[..., EnvBase], num_envs: int) -> EnvBase:
     return env.append_transform(sums)
 
 
+def cost_limits(config: Config, saved: SavedPolicy) -> tuple[float, ...]:
+    """The limits that are given, or else those of the training."""
+    if config.cost_limits or "cost_limit" not in saved.settings:
+        return config.cost_limits or tuple(saved.settings.get("cost_limits", ()))
+    return (saved.settings["cost_limit"],)
+
+
 def check_fit(env: EnvBase, saved: SavedPolicy, config: Config) -> None:
     """Raises ValueError unless the environment is one that can be played as it is asked for."""
     widths = {
@@ -110,11 +122,10 @@ def check_fit(env: EnvBase, saved: SavedPolicy, config: Config) -> None:
                 f"env must have {name} of width {getattr(saved.spec, name)}, which the policy was "
                 f"trained for, got {width}."
             )
-    costs = num_costs(env)
-    if len(config.cost_limits or (1,)) != costs:
+    costs, limits = num_costs(env), cost_limits(config, saved)
+    if len(limits) != costs:
         raise ValueError(
-            f"cost_limits must be one for each of the {costs} costs of env, got "
-            f"{config.cost_limits}."
+            f"cost_limits must be one for each of the {costs} costs of env, got {limits}."
         )
     if not is_arm(env):
         if config.max_steps is None:
@@ -169,7 +180,7 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)
     saved = load_policy(config.policy)
     make_env = factory(config, saved)
-    limits = config.cost_limits or (saved.settings["cost_limit"],)
+    limits = cost_limits(config, saved)
     env = make_env(num_envs=config.envs)
     try:
         check_fit(env, saved, config)

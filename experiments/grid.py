@@ -7,13 +7,14 @@ import json
 import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from experiments.files import write_whole
+from experiments.log import versions
+from torchrl_safe.checkpoint import refuse_other_settings
 
 
 def missing(jobs: Mapping[Path, Any]) -> list[Path]:
@@ -66,7 +67,7 @@ def save_results(out: Path, config: Any, runs: Sequence[dict[str, Any]], table: 
     """
     results = {
         "config": dataclasses.asdict(config),
-        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
+        "versions": versions(),
         "runs": runs,
     }
     write_whole(out / "results.json", json.dumps(results, default=str))
@@ -81,11 +82,19 @@ def _run_and_keep(run: Callable[..., dict[str, Any]], path: Path, arguments: Any
 
 def _check_same(path: Path, arguments: Any) -> None:
     kept, wanted = json.loads(path.read_text())["arguments"], _plain(arguments)
-    if kept != wanted:
+    try:
+        refuse_other_settings(_by_name(kept), _by_name(wanted))
+    except ValueError as error:
         raise ValueError(
-            f"out must be a folder of the same settings, got {str(path)!r} with {kept} instead of "
-            f"{wanted}."
-        )
+            f"out must be a folder of the same run, got {str(path)!r}: {error}."
+        ) from error
+
+
+def _by_name(arguments: list[Any]) -> dict[str, Any]:
+    named: dict[str, Any] = {}
+    for index, value in enumerate(arguments):
+        named.update(value if isinstance(value, dict) else {f"argument {index}": value})
+    return named
 
 
 def _plain(arguments: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
 from time import perf_counter
@@ -94,3 +95,8 @@ def score(rows: Sequence[dict[str, float]], limit: float) -> float | None:
     if not ended or any(fmean(row[name] for row in ended) > limit for name in costs):
         return None
     return fmean(row["return"] for row in ended)
+
+
+def versions() -> dict[str, str]:
+    """What the figures of a run depend on beside its settings."""
+    return {name: version(name) for name in ("torch", "torchrl", "pybullet")}

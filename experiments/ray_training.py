@@ -35,6 +35,7 @@ from experiments import train
 from experiments.algorithms import ALGORITHMS
 from experiments.files import is_new
 from experiments.log import Log, figures
+from experiments.policy import save_policy
 from torchrl_safe.envs import ArmEnv, Collision, Speed
 from torchrl_safe.objectives import DualAscent
 
@@ -184,7 +185,17 @@ def main(config: Config) -> dict[str, Any]:
                 bar.update()
         finally:
             collection.close()
-    train.keep_policy(settings, "ppo-lagrangian", training)
+    save_policy(
+        config.out / "ppo-lagrangian" / "policy.pt",
+        training.actor,
+        training.actor_spec,
+        {
+            "env": f"{make_env.__module__}:{make_env.__name__}",
+            "cost_limits": list(config.cost_limits),
+            "frames": config.frames,
+            "seed": config.seed,
+        },
+    )
     return {**log.rows[-1], "replaced": collection.replaced}
 
 

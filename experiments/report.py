@@ -98,15 +98,25 @@ def save_animation(
 ) -> None:
     """Saves a GIF of the deterministic policy, at half speed."""
     frames: list[Image.Image] = []
+    # GIF counts in hundredths of a second, and viewers take their time for very few of them.
+    every = max(1, round(env.control_rate / 20))
+    steps = 0
 
-    def film(env: EnvBase, tensordict: TensorDictBase) -> None:
+    def shoot() -> None:
         frames.append(Image.fromarray(env.render(width=320, height=240)[0].numpy()))
+
+    def film(*_: Any) -> None:
+        nonlocal steps
+        if steps % every == 0:
+            shoot()
+        steps += 1
 
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(episodes):
             env.rollout(env.max_episode_steps, policy, callback=film)
+            shoot()  # Of the last step TorchRL says nothing.
     path.parent.mkdir(parents=True, exist_ok=True)
-    milliseconds = round(2000 / env.control_rate)
+    milliseconds = round(2000 * every / env.control_rate)
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
 
 

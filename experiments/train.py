@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 from time import strftime
@@ -30,7 +29,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, OffPolicy, Training
 from experiments.evaluation import evaluate, summarize
 from experiments.files import is_new, write_whole
-from experiments.log import Log, figures, score
+from experiments.log import Log, figures, score, versions
 from experiments.policy import save_policy
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
@@ -116,7 +115,7 @@ class Config:
     envs: int = 32
     """Simulated worlds, shared among the workers."""
     workers: int = 2
-    """Processes that simulate; with 1 this process does."""
+    """Processes that simulate; with 1 this process does. Another number gives other episodes."""
     seed: int = 0
     """Seed of networks, environments and minibatches."""
     out: Path = dataclasses.field(
@@ -345,6 +344,7 @@ def train_and_evaluate(
     episodes = evaluate(env, actor, config.eval_episodes, seed=config.seed + 1_000_000)
     env.close()
     return actor, {
+        "versions": versions(),
         "seconds": seconds,
         "history": log.rows,
         "evaluation": summarize(episodes, tuple(COSTS)),
@@ -360,11 +360,7 @@ def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
 def start(config: Config) -> dict[str, Any]:
     """Begins a run, or reads what one that is resumed has finished."""
     path = config.out / "results.json"
-    results: dict[str, Any] = {
-        "config": dataclasses.asdict(config),
-        "versions": {name: version(name) for name in ("torch", "torchrl", "pybullet")},
-        "algorithms": {},
-    }
+    results: dict[str, Any] = {"config": dataclasses.asdict(config), "algorithms": {}}
     if config.resume and path.exists():
         before = json.loads(path.read_text())
         refuse_other_settings(settings(before["config"]), settings(results["config"]))

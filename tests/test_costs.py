@@ -255,17 +255,29 @@ def test_sensing_adds_up():
     [
         (lambda: Sensing(clearance=-1), "clearance must be finite and not negative, got -1"),
         (lambda: Sensing(clearance=np.nan), "clearance must be finite and not negative, got nan"),
-        (lambda: ContactForce(limit=-1), "limit must not be negative, got -1"),
-        (lambda: ContactForce(limit=np.nan), "limit must be finite, got nan"),
-        (lambda: ContactForce(limit=[1, 2]), r"limit must have shape \(\), got \(2,\)"),
+        (lambda: ContactForce(limit=-1), "limit must be finite and not negative, got -1"),
+        (lambda: ContactForce(limit=np.nan), "limit must be finite and not negative, got nan"),
+        (
+            lambda: ContactForce(limit=[1, 2]),
+            r"limit must be finite and not negative, got \[1, 2\]",
+        ),
         (lambda: Proximity(margin=0), "margin must be positive and finite, got 0"),
         (lambda: Proximity(margin=np.inf), "margin must be positive and finite, got inf"),
-        (lambda: JointLimit(margin=-0.1), "margin must not be negative, got -0.1"),
-        (lambda: Speed(limit=-0.1), "limit must not be negative, got -0.1"),
-        (lambda: Speed(limit=np.inf), "limit must be finite, got inf"),
-        (lambda: SpeedAndSeparation(reaction_time=-1), "reaction_time must not be negative, got"),
-        (lambda: SpeedAndSeparation(stopping_time=np.nan), "stopping_time must be finite, got nan"),
-        (lambda: SpeedAndSeparation(intrusion=-1), "intrusion must not be negative, got -1"),
+        (lambda: JointLimit(margin=-0.1), "margin must be finite and not negative, got -0.1"),
+        (lambda: Speed(limit=-0.1), "limit must be finite and not negative, got -0.1"),
+        (lambda: Speed(limit=np.inf), "limit must be finite and not negative, got inf"),
+        (
+            lambda: SpeedAndSeparation(reaction_time=-1),
+            "reaction_time must be finite and not negative, got",
+        ),
+        (
+            lambda: SpeedAndSeparation(stopping_time=np.nan),
+            "stopping_time must be finite and not negative, got nan",
+        ),
+        (
+            lambda: SpeedAndSeparation(intrusion=-1),
+            "intrusion must be finite and not negative, got -1",
+        ),
         (lambda: SpeedAndSeparation(horizon=0.05), r"horizon must be larger .* 0.05, got 0.05"),
     ],
 )

@@ -190,6 +190,10 @@ def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):
         evaluate.main(evaluate.Config(tmp_path / "policy.pt", max_steps=4, **settings))
     with pytest.raises(ValueError, match="max_steps must be given"):
         evaluate.main(evaluate.Config(tmp_path / "policy.pt", **settings))
+    with pytest.raises(ValueError, match=r"cost_limits must be one for each of the 3 .* got \(\)"):
+        evaluate.main(
+            evaluate.Config(tmp_path / "policy.pt", max_steps=5, **{**settings, "cost_limits": ()})
+        )
 
 
 @pytest.mark.parametrize(

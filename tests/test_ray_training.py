@@ -6,7 +6,7 @@ import pytest
 import ray
 import torch
 
-from experiments import train
+from experiments import evaluate, train
 from experiments.algorithms import ALGORITHMS
 from experiments.policy import load_policy
 from experiments.ray_training import COSTS, Collection, Config, cluster, main, make_env
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarn
 SMALL = Config(envs=2, frames=480, frames_per_batch=160)
 
 
-def test_two_costs_and_their_multipliers(tmp_path):
+def test_two_costs_and_their_multipliers(tmp_path, capsys):
     last = main(
         Config(envs=2, frames=480, frames_per_batch=160, cost_limits=(0.0, 40.0), out=tmp_path)
     )
@@ -31,7 +31,13 @@ def test_two_costs_and_their_multipliers(tmp_path):
     assert len(multipliers) == 3
     assert multipliers == sorted(multipliers)
     assert multipliers[-1] == pytest.approx(last["multiplier/collision"])
-    assert load_policy(tmp_path / "ppo-lagrangian" / "policy.pt").settings["cost_limit"] == 0
+    file = tmp_path / "ppo-lagrangian" / "policy.pt"
+    assert load_policy(file).settings["cost_limits"] == [0.0, 40.0]
+    with pytest.raises(ValueError, match=r"trained in experiments\.ray_training:make_env"):
+        evaluate.main(evaluate.Config(file))
+    settings = {"env": "experiments.ray_training:make_env", "episodes": 2, "envs": 2}
+    evaluate.main(evaluate.Config(file, **settings))
+    assert "Cost limit 0, 40;" in capsys.readouterr().out
 
 
 def test_an_actor_is_killed_on_the_way():

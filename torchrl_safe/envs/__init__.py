@@ -36,7 +36,7 @@ from torchrl_safe.envs.kinematics import (
 from torchrl_safe.envs.moving import Motion, Moving, Patrol, Swing
 from torchrl_safe.envs.observations import FullObservation, paper_observation
 from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placement, Scattered
-from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, paper_env
+from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS, paper_env
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.saute import Saute
 from torchrl_safe.envs.scene import Camera, Scene
@@ -50,6 +50,7 @@ __all__ = [
     "PANDA",
     "PAPER_CARTESIAN",
     "PAPER_JOINT",
+    "PAPER_SETTINGS",
     "PARALLEL_GRIPPER",
     "UR5",
     "UR10",

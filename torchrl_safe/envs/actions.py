@@ -46,7 +46,8 @@ class CartesianDelta:
     that turn it, and last the one that moves the fingers.
 
     Args:
-        step: displacement that an action of 1 asks for, m.
+        step: displacement that an action of 1 asks for, m. The motors do a part of it until the
+            next action: the scene's ``motor_gain``, and the speed limits of the joints.
         bound: largest magnitude of a component; infinity leaves actions unclipped.
         inverse_kinematics: turns tool poses into joint angles.
         orientation: tool orientation to keep, a quaternion (x, y, z, w). ``None`` keeps that of
@@ -140,10 +141,9 @@ class CartesianDelta:
 class JointDelta:
     """Turns each joint by ``step`` radians times the action (the paper's AR2).
 
-    With a step of speed / control rate, actions are joint velocities in units of that speed.
-
     Args:
-        step: rotation that an action of 1 asks for, rad.
+        step: rotation that an action of 1 asks for, rad. How much of it the motors do until the
+            next action is the scene's ``motor_gain``: by default 65 %.
         bound: largest magnitude of a component; infinity leaves actions unclipped.
         respect_limits: never ask for an angle beyond the joint limits.
         finger_step: if given, a last component sets the free fingers' position, in metres per

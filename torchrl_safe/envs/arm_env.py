@@ -18,25 +18,22 @@ from torchrl._utils import seed_generator
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_safe._checks import check_count
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta
 from torchrl_safe.envs.arms import PANDA, ArmModel
 from torchrl_safe.envs.batch import WorldBatch
 from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.checks import check_array, check_count, check_kind
+from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.costs import Collision
-from torchrl_safe.envs.kinematics import distance_to_reach
 from torchrl_safe.envs.observations import FullObservation
-from torchrl_safe.envs.obstacles import InFront, Obstacles, Placement
+from torchrl_safe.envs.obstacles import InFront, Obstacles
 from torchrl_safe.envs.record import EpisodeRecord, pack, unpack
 from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
+from torchrl_safe.envs.starts import Starts
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Sensor
 from torchrl_safe.envs.tasks import Reach, Task
 
 Cost = Callable[[ArmState], Array]
-
-# Episodes that are tried when an environment is made; how near, in m, counts as reached there;
-# and how often obstacles are drawn until they leave the arm free.
-_CHECKED_STARTS, _REACHED, _ATTEMPTS = 50, 0.02, 100
 
 
 class ArmEnv(EnvBase):
@@ -166,8 +163,9 @@ class ArmEnv(EnvBase):
             frame_skip=frame_skip,
             gui=gui,
         )
+        self._starts = Starts(arm, task, obstacles, self._batch)
         try:
-            self._check_starts()
+            self._starts.check()
             self._make_specs()
         except BaseException:
             self._batch.close()
@@ -208,24 +206,6 @@ class ArmEnv(EnvBase):
     def control_rate(self) -> float:
         """Actions a second, Hz."""
         return 1 / (SUBSTEP * self.frame_skip)
-
-    def _check_starts(self) -> None:
-        # Goals out of reach, or that leave the obstacles no room, show here rather than after
-        # hours of training.
-        generator = np.random.default_rng(0)
-        for _ in range(_CHECKED_STARTS):
-            goal, objects = self._draw_task(generator)
-            for name, points in (("goals", goal[None]), ("objects", objects)):
-                for point in points:
-                    miss = distance_to_reach(self._worlds[0], self.arm.home, point)
-                    if miss > _REACHED:
-                        raise ValueError(
-                            f"task must draw {name} that the arm can reach, got "
-                            f"{point.round(3).tolist()} from {self.task}, from which the tool "
-                            f"stays {miss:.3f} m away: give the task another region, or the "
-                            "arm other goals."
-                        )
-            self._reset_world(0, generator)
 
     def _make_specs(self) -> None:
         for row in range(self.num_envs):
@@ -438,38 +418,9 @@ class ArmEnv(EnvBase):
         change = np.clip(fingers - state.finger_position, -longest, longest)
         return joints, state.finger_position + change
 
-    def _draw_task(self, generator: np.random.Generator) -> tuple[Array, Array]:
-        goal, objects = self.task.sample(generator, self.arm.goals)
-        goal = check_array("goal", goal, (3,))
-        return goal, check_array("objects", objects, (len(self.task.objects), 3))
-
-    def _draw_obstacles(
-        self, generator: np.random.Generator, goal: Array, objects: Array
-    ) -> Placement:
-        start = objects[0] if len(objects) else np.array(self._worlds[0].home_position)
-        placement = self.obstacles.sample(generator, start, goal)
-        check_kind("placement", placement, Placement)
-        count = len(self.obstacles.shapes)
-        check_array("obstacle positions", placement.position, (count, 3))
-        if placement.path is not None and any(shape.mass for shape in self.obstacles.shapes):
-            raise ValueError(
-                f"path moves fixed shapes only (mass 0), got one for {self.obstacles.shapes}."
-            )
-        return placement
-
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:
         self._record.begin(row, generator)
-        goal, objects = self._draw_task(generator)
-        for _ in range(_ATTEMPTS):
-            placement = self._draw_obstacles(generator, goal, objects)
-            self._batch.reset(row, placement, goal, objects)
-            if (clearance := self._worlds[row].clearance()) > 0:
-                break
-        else:
-            raise ValueError(
-                f"obstacles must leave the arm free at home and the objects where they are, got an "
-                f"overlap of {-clearance:.4f} m from {self.obstacles}."
-            )
+        self._starts.begin(row, generator)
         self._elapsed[row] = 0
 
     def _observe(self, state: ArmState) -> Array:

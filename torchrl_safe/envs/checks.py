@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import operator
 from numbers import Real
 from types import UnionType
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
-from torchrl_safe.envs.state import Array
+_LARGEST = np.finfo(np.float32).max
 
 
 def check_positive(**values: float) -> None:
@@ -27,17 +27,6 @@ def check_not_negative(**values: float) -> None:
             raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
 
 
-def check_count(**values: int) -> None:
-    """Raises ValueError unless each value is a whole number of at least 1."""
-    for name, value in values.items():
-        try:
-            usable = not isinstance(value, bool) and 1 <= operator.index(value) < 2**31
-        except TypeError:
-            usable = False
-        if not usable:
-            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
-
-
 def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
     """Raises TypeError unless the value is an object of a class or protocol, not a class."""
     if isinstance(value, type) or not isinstance(value, kind):
@@ -46,8 +35,11 @@ def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
         raise TypeError(f"{name} must be an instance of {names}, got {value!r}.")
 
 
-def check_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
-    """Returns the values as an array; raises ValueError unless they have a shape and are finite."""
+def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Returns the values as an array; raises ValueError unless they have a shape and are finite.
+
+    Finite in single precision, which is what tensors of them will have.
+    """
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "biuf":  # Not of text or objects, which NumPy converts too.
@@ -57,7 +49,7 @@ def check_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
         raise ValueError(f"{name} must be numbers of shape {shape}, got {values!r}.") from error
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}.")
-    if not np.isfinite(array).all():
+    if not (np.abs(array) <= _LARGEST).all():
         raise ValueError(f"{name} must be finite, got {array}.")
     return array
 

@@ -11,7 +11,7 @@ from numbers import Real
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_array, check_kind, check_positive
+from torchrl_safe.envs.checks import check_kind, check_not_negative, check_positive
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.state import ArmState, Array, Sensing
 
@@ -98,7 +98,7 @@ class ContactForce:
     limit: float = 140.0
 
     def __post_init__(self) -> None:
-        _check_limit(limit=self.limit)
+        check_not_negative(limit=self.limit)
 
     def __call__(self, state: ArmState) -> Array:
         """Returns the cost of each world, shape ``(N,)``."""
@@ -165,7 +165,7 @@ class JointLimit:
     margin: float = 0.05
 
     def __post_init__(self) -> None:
-        _check_limit(margin=self.margin)
+        check_not_negative(margin=self.margin)
 
     @property
     def sensing(self) -> Sensing:
@@ -205,7 +205,7 @@ class Speed:
     any_link: bool = False
 
     def __post_init__(self) -> None:
-        _check_limit(limit=self.limit)
+        check_not_negative(limit=self.limit)
 
     @property
     def sensing(self) -> Sensing:
@@ -257,7 +257,7 @@ class SpeedAndSeparation:
     horizon: float = 0.5
 
     def __post_init__(self) -> None:
-        _check_limit(
+        check_not_negative(
             reaction_time=self.reaction_time,
             stopping_time=self.stopping_time,
             intrusion=self.intrusion,
@@ -319,9 +319,3 @@ class Workspace:
     def __call__(self, state: ArmState) -> Array:
         """Returns the cost of each world, shape ``(N,)``."""
         return (~self.region.contains(state.trace["ee_position"])).any(axis=1).astype(float)
-
-
-def _check_limit(**limits: float) -> None:
-    for name, limit in limits.items():
-        if check_array(name, limit, ()) < 0:
-            raise ValueError(f"{name} must not be negative, got {limit}.")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_count
+from torchrl_safe._checks import check_count
 from torchrl_safe.envs.state import ArmState, Array
 
 

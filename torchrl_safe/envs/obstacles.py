@@ -9,9 +9,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_safe._checks import check_count
 from torchrl_safe.envs.checks import (
     check_array,
-    check_count,
     check_kind,
     check_not_negative,
     check_positive,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
@@ -29,6 +31,30 @@ PAPER_CARTESIAN = CartesianDelta(
 
 #: AR2: increments of the seven joints, not clipped.
 PAPER_JOINT = JointDelta(step=0.1, bound=math.inf, respect_limits=False)
+
+#: Arguments of :class:`~torchrl_safe.envs.ArmEnv`, all but the action.
+PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
+    {
+        "arm": replace(PANDA, home=(0, -0.215, 0, -2.57, 0, 2.356, 2.356), finger_home=0.08),
+        "task": Reach(Region((0.6, -0.2, 0.05), (0.8, 0.2, 0.05)), radius=0.09, order=1),
+        "obstacles": InFront(gap=0.2, shape=Cylinder(mass=1.0), direction=(1, 0, 0), height=0.05),
+        "costs": {"collision": Collision(margin=CONTACT_RANGE)},
+        "observation": paper_observation,
+        "frame_skip": 1,
+        "max_episode_steps": 500,
+        "scene": Scene(
+            gravity=10.0,
+            furniture=(("plane.urdf", (0, 0, -0.65)), ("table/table.urdf", (0.5, 0, -0.65))),
+            target_urdf="lego/lego.urdf",
+            free_fingers=True,
+            merged_links=False,
+            motor_limits=False,
+            motor_gain=0.1,
+            urdf_inertia=True,
+            fresh_links=False,
+        ),
+    }
+)
 
 
 def paper_env(action: ActionMode = PAPER_CARTESIAN, **kwargs: Any) -> ArmEnv:
@@ -57,26 +83,4 @@ def paper_env(action: ActionMode = PAPER_CARTESIAN, **kwargs: Any) -> ArmEnv:
         (torch.Size([1, 8]), torch.Size([1, 7]))
         >>> env.close()
     """
-    arm = replace(PANDA, home=(0, -0.215, 0, -2.57, 0, 2.356, 2.356), finger_home=0.08)
-    settings: dict[str, Any] = {
-        "arm": arm,
-        "action": action,
-        "task": Reach(Region((0.6, -0.2, 0.05), (0.8, 0.2, 0.05)), radius=0.09, order=1),
-        "obstacles": InFront(gap=0.2, shape=Cylinder(mass=1.0), direction=(1, 0, 0), height=0.05),
-        "costs": {"collision": Collision(margin=CONTACT_RANGE)},
-        "observation": paper_observation,
-        "frame_skip": 1,
-        "max_episode_steps": 500,
-        "scene": Scene(
-            gravity=10.0,
-            furniture=(("plane.urdf", (0, 0, -0.65)), ("table/table.urdf", (0.5, 0, -0.65))),
-            target_urdf="lego/lego.urdf",
-            free_fingers=True,
-            merged_links=False,
-            motor_limits=False,
-            motor_gain=0.1,
-            urdf_inertia=True,
-            fresh_links=False,
-        ),
-    }
-    return ArmEnv(**{**settings, **kwargs})
+    return ArmEnv(**{**PAPER_SETTINGS, "action": action, **kwargs})

@@ -24,13 +24,13 @@ class Scene:
             simulator. ``None`` makes the target a mere point.
         free_fingers: leave the joints that are not part of the arm movable.
         merged_links: simulate links that fixed joints hold together as one, with
-            the contact properties of the first link, for a fifth to a third less of a physics
-            step. With ``urdf_inertia`` it is the same body; else its inertia is that of another
+            the contact properties of the first link: a physics step takes 15 to 40 % less
+            time. With ``urdf_inertia`` it is the same body; else its inertia is that of another
             box. Not done where the task moves objects, whose grip depends on these properties.
         motor_limits: keep the motors within the efforts and speeds of the URDF.
-        motor_gain: share of the way to the joint targets that the motors ask for in each
-            physics substep. ``None`` asks for the speed that is there at the end of the control
-            step.
+        motor_gain: share of the way that is left to the joint targets that the motors go in
+            each physics substep. ``None`` is 1 / ``frame_skip``; with 12 substeps they have gone
+            65 % of the way at the end of the control step, fastest at its beginning.
         urdf_inertia: take inertias from the URDF instead of from the collision shapes.
         fresh_links: read the tool pose of the current joint angles. ``False`` reads it one
             physics substep late, as PyBullet does unless told otherwise.

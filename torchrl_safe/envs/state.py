@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from numbers import Real
 from typing import NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from torchrl_safe.envs.checks import check_not_negative
 
 Array = NDArray[np.float64]
 
@@ -60,8 +61,7 @@ class Sensing:
     links: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.clearance, Real) or not 0 <= self.clearance < np.inf:
-            raise ValueError(f"clearance must be finite and not negative, got {self.clearance!r}.")
+        check_not_negative(clearance=self.clearance)
 
     def __or__(self, other: Sensing) -> Sensing:
         return Sensing(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from numbers import Real
 from typing import Any
 
@@ -13,16 +12,6 @@ from torch import Tensor
 # Losses compute in single precision, also with squares of what is positive, and divide by them.
 _LARGEST = torch.finfo(torch.float32).max
 _SMALLEST, _LARGE = 1e-18, 1e18
-
-
-def check_count(name: str, value: Any, *, least: int = 1) -> None:
-    """Raises ValueError unless the value is a whole number, and not too small."""
-    try:
-        usable = not isinstance(value, bool) and least <= operator.index(value) < 2**31
-    except TypeError:
-        usable = False
-    if not usable:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
 
 
 def check_number(name: str, value: Any, *, positive: bool = False) -> float:

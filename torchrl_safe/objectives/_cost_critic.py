@@ -16,7 +16,8 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _clip_value_loss, _get_default_device, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives._checks import check_count, check_number
+from torchrl_safe._checks import check_count
+from torchrl_safe.objectives._checks import check_number
 from torchrl_safe.objectives.cost_gae import CostGAE, centred
 
 Self = TypeVar("Self", bound="CostCriticMixin")
@@ -61,7 +62,7 @@ class CostCriticMixin(LossModule):
         device: torch.device | None = None,
         **kwargs: Any,
     ) -> None:
-        check_count("num_costs", num_costs)
+        check_count(num_costs=num_costs)
         cost_critic_coeff = check_number("cost_critic_coeff", cost_critic_coeff)
         # The parent's constructor already asks for in_keys, before a module can be assigned.
         self._cost_critic_in_keys = list(cost_critic_network.in_keys)

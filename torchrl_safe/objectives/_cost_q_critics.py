@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives._checks import check_count
+from torchrl_safe._checks import check_count
 from torchrl_safe.objectives._cost_critic import build_value_estimators, get_or_raise
 from torchrl_safe.objectives._lagrange import initial_multiplier
 from torchrl_safe.objectives.cost_td0 import CostTD0
@@ -57,8 +57,8 @@ class CostCriticsMixin(LossModule):
         multiplier_init: float | Tensor = 0.0,
         **kwargs: Any,
     ) -> None:
-        check_count("num_costs", num_costs)
-        check_count("num_cost_qvalue_nets", num_cost_qvalue_nets)
+        check_count(num_costs=num_costs)
+        check_count(num_cost_qvalue_nets=num_cost_qvalue_nets)
         multiplier = initial_multiplier(num_costs, multiplier_init)
         networks = _as_list(cost_qvalue_network)
         if networks is not None and len(networks) != num_cost_qvalue_nets:

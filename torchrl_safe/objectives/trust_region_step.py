@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, PPOLoss
 
+from torchrl_safe._checks import check_count
 from torchrl_safe.objectives._actor import (
     actor_distribution,
     actor_parameters,
@@ -18,7 +19,7 @@ from torchrl_safe.objectives._actor import (
     read_flat,
     write_flat,
 )
-from torchrl_safe.objectives._checks import as_number, check_count, check_number
+from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives._cost_critic import get_or_raise
 from torchrl_safe.objectives.focops import FOCOPSLoss
 from torchrl_safe.objectives.trust_region import (
@@ -135,8 +136,8 @@ class TrustRegionStep:
         _check_loss(loss_module, method)
         if episode_length is not None:
             episode_length = check_number("episode_length", episode_length, positive=True)
-        check_count("cg_iterations", cg_iterations)
-        check_count("max_backtracks", max_backtracks, least=0)
+        check_count(cg_iterations=cg_iterations)
+        check_count(max_backtracks=max_backtracks, least=0)
         if not 0 < as_number(shrink) < 1:
             raise ValueError(f"shrink must be more than 0 and less than 1, got {shrink!r}.")
         self.loss_module = loss_module
