@@ -325,6 +325,13 @@ def get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     return tensor
 
 
+def report_each(losses: TensorDictBase, name: str, values: Tensor) -> None:
+    """Adds an output for each cost, from a buffer of shape ``(k,)``."""
+    # Scalars, since trainers and loggers keep no others; cloned, since buffers change in place.
+    for index, value in enumerate(values.clone().unbind()):
+        losses.set(f"{name}_{index}", value)
+
+
 def build_value_estimators(loss: CostCriticMixin, *_: Any) -> None:
     # Their buffers are part of the state: a fresh and a used loss then have the same entries.
     _ = loss.value_estimator, loss.cost_value_estimator

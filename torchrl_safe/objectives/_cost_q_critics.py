@@ -15,7 +15,11 @@ from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
-from torchrl_safe.objectives._cost_critic import build_value_estimators, get_or_raise
+from torchrl_safe.objectives._cost_critic import (
+    build_value_estimators,
+    get_or_raise,
+    report_each,
+)
 from torchrl_safe.objectives._lagrange import initial_multiplier
 from torchrl_safe.objectives.cost_td0 import CostTD0
 from torchrl_safe.objectives.functional import penalized_advantage
@@ -220,10 +224,7 @@ class CostCriticsMixin(LossModule):
         return losses
 
     def _report_multipliers(self, losses: TensorDictBase) -> None:
-        # One scalar for each cost, since trainers and loggers keep scalars only; cloned, since
-        # the buffer changes in place.
-        for index, multiplier in enumerate(self.lagrange_multiplier.clone().unbind()):
-            losses.set(f"lagrange_multiplier_{index}", multiplier)
+        report_each(losses, "lagrange_multiplier", self.lagrange_multiplier)
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()

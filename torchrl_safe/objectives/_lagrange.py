@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_safe.objectives._checks import as_tensor
-from torchrl_safe.objectives._cost_critic import CostCriticMixin
+from torchrl_safe.objectives._cost_critic import CostCriticMixin, report_each
 from torchrl_safe.objectives.functional import penalized_advantage
 
 
@@ -34,10 +34,7 @@ class LagrangeMultiplierMixin(CostCriticMixin):
 
     def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
         super()._set_cost_outputs(losses, tensordict)
-        # One scalar for each cost, since trainers and loggers keep scalars only; cloned, since
-        # the buffer changes in place.
-        for index, multiplier in enumerate(self.lagrange_multiplier.clone().unbind()):
-            losses.set(f"lagrange_multiplier_{index}", multiplier)
+        report_each(losses, "lagrange_multiplier", self.lagrange_multiplier)
 
     def _cost_out_keys(self) -> list[NestedKey]:
         multipliers = [f"lagrange_multiplier_{i}" for i in range(len(self.lagrange_multiplier))]

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_safe.objectives._cost_critic import CostCriticMixin
+from torchrl_safe.objectives._cost_critic import CostCriticMixin, report_each
 from torchrl_safe.objectives._cost_updater import CostUpdater
 
 
@@ -64,9 +64,7 @@ class ViolationMixin(CostCriticMixin):
 
     def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
         super()._set_cost_outputs(losses, tensordict)
-        # Scalars and clones, as of the multipliers.
-        for index, violation in enumerate(self.cost_violation.clone().unbind()):
-            losses.set(f"cost_violation_{index}", violation)
+        report_each(losses, "cost_violation", self.cost_violation)
 
     def _cost_out_keys(self) -> list[NestedKey]:
         return [
