@@ -185,11 +185,12 @@ def blind(state):
     ("settings", "message"),
     [
         ({"cost": Fails(calls=1, value=NAN)}, "cost 'cost' must be finite"),
+        ({"cost": Fails(calls=1, value=1e39)}, "cost 'cost' must be finite"),
         ({"cost": Fails(calls=1, value=np.inf)}, "cost 'cost' must be finite"),
         ({"task": Lost()}, "reward must be finite"),
         ({"observation": blind}, "observation must be finite"),
     ],
-    ids=["cost", "infinite-cost", "reward", "observation"],
+    ids=["cost", "cost-beyond-float32", "infinite-cost", "reward", "observation"],
 )
 def test_the_arm_refuses_nan(settings, message, make_env):
     env = make_env(arm, **settings)
