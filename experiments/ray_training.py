@@ -157,7 +157,6 @@ def main(config: Config) -> dict[str, Any]:
         frames=config.frames,
         frames_per_batch=config.frames_per_batch,
         seed=config.seed,
-        out=config.out,
     )
     env = make_env(num_envs=8)
     training = ALGORITHMS["ppo-lagrangian"].build(env, settings)

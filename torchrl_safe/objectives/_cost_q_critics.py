@@ -61,8 +61,7 @@ class CostCriticsMixin(LossModule):
         multiplier_init: float | Tensor = 0.0,
         **kwargs: Any,
     ) -> None:
-        check_count(num_costs=num_costs)
-        check_count(num_cost_qvalue_nets=num_cost_qvalue_nets)
+        check_count(num_costs=num_costs, num_cost_qvalue_nets=num_cost_qvalue_nets)
         multiplier = initial_multiplier(num_costs, multiplier_init)
         networks = _as_list(cost_qvalue_network)
         if networks is not None and len(networks) != num_cost_qvalue_nets:
