@@ -75,7 +75,7 @@ from torchrl.objectives import LossModule
 
 loss = LossModule()
 loss.register_buffer("lagrange_multiplier", torch.zeros(1))
-rule = Exponentiated(loss, cost_limit=0.5, normalize=True)
+rule = Exponentiated(loss, cost_limit=0.5)
 for cost in (30.0, 0.0):
     for _ in range(40):
         rule.step(torch.full((4, 1), cost))

@@ -51,7 +51,8 @@ class MultiplierUpdater(CostUpdater):
         >>> class Exponentiated(MultiplierUpdater):
         ...     def next_multiplier(self, multiplier, violation):
         ...         # By a factor of 1.2 at most. The lower bound lets it start from 0.
-        ...         return multiplier.clamp_min(0.01) * (0.2 * violation.clamp(-1, 1)).exp()
+        ...         step = 0.2 * (violation / self.cost_limit).clamp(-1, 1)
+        ...         return multiplier.clamp_min(0.01) * step.exp()
         >>> loss = LossModule()
         >>> loss.register_buffer("lagrange_multiplier", torch.zeros(1))
         >>> updater = Exponentiated(loss, cost_limit=2.0, max_multiplier=10.0)
