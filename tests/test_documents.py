@@ -37,7 +37,7 @@ env = ArmEnv(PANDA, seed=1)
 tensordict = env.reset()
 for _ in range(5):
     action = policy(tensordict["observation"][0].numpy())
-    tensordict["action"][0] = torch.from_numpy(action)
+    tensordict["action"] = torch.from_numpy(action)[None]
     tensordict = env.step(tensordict)["next"]
     print("moved by", abs(action).max())
 print(action.shape)
