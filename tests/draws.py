@@ -5,6 +5,7 @@ would draw again. Any other error ends it.
 """
 
 import argparse
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 
@@ -54,7 +55,8 @@ def main():
             for arm, task in product(ARMS, TASKS)
         }
         for (arm, task), future in futures.items():
-            print(arm, task, future.result(), flush=True)
+            sys.stdout.write(f"{arm} {task} {future.result()}\n")
+            sys.stdout.flush()
 
 
 if __name__ == "__main__":
