@@ -5,12 +5,13 @@ from __future__ import annotations
 import copy
 import dataclasses
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_safe.testing._losses import (
@@ -90,8 +91,8 @@ def check_keys(
 
     def run(keys: Mapping[str, NestedKey]) -> TensorDictBase:
         loss = build(make_loss, make_networks, num_costs, keys=keys)
-        default = {name: getattr(default_keys, name) for name in keys}
         loss.set_keys(**keys)
+        default = {name: getattr(default_keys, name) for name in keys}
         constrain(loss, torch.ones(num_costs))
         data = make_data(num_costs)
         for name, key in keys.items():
@@ -343,10 +344,6 @@ def check_compile(
     Raises:
         AssertionError: if an output differs from the loss's, or a second graph is traced.
         torch._dynamo.exc.Unsupported: if the loss cannot be one graph.
-
-    Examples:
-        >>> from torchrl_safe.objectives import PPOLagrangianLoss
-        >>> check_compile(PPOLagrangianLoss)
     """
     loss, data = build(make_loss, make_networks, num_costs), make_data(num_costs)
     backend = _Counter()
@@ -357,19 +354,32 @@ def check_compile(
         warnings.filterwarnings("ignore", ".*inline_inbuilt_nn_modules", FutureWarning)
         # Dynamo warns about TorchRL's own TanhNormal.
         warnings.filterwarnings("ignore", ".*should not be instantiated", DeprecationWarning)
-        outputs = []
+        totals = []
         for size in (0.0, 2.5):
             constrain(loss, torch.full((num_costs,), size))
-            expected = call(loss, data)
-            outputs.append(call(compiled, data))
-            what = f"{named(loss)}: compiled, multipliers at {size}"
-            require_same_outputs(what, outputs[-1], expected, exact=False)
+            what = f"{named(loss)}: compiled, under constraint with strength {size}"
+            (expected, slopes), (losses, actual) = (
+                _with_gradients(each, loss, data) for each in (loss, compiled)
+            )
+            require_same_outputs(what, losses, expected, exact=False)
+            for name, slope in slopes.items():
+                require_close(f"{what}, gradient by {name}", actual[name], slope)
+            totals.append(total(losses))
     require(
         backend.graphs == 1,
-        f"{named(loss)}: moving the multipliers took {backend.graphs} graphs instead of one",
+        f"{named(loss)}: constraints with another strength took {backend.graphs} graphs, not one",
     )
     require(
-        bool(total(outputs[0]) != total(outputs[1])),
-        f"{named(loss)}: moving the multipliers changed no loss",
+        bool(totals[0] != totals[1]),
+        f"{named(loss)}: constraints with another strength changed no loss",
     )
-    total(outputs[1]).backward()
+
+
+def _with_gradients(
+    evaluate: Callable[[TensorDictBase], TensorDictBase], loss: LossModule, data: TensorDictBase
+) -> tuple[TensorDictBase, dict[str, Tensor]]:
+    """Outputs, and the gradients of their sum."""
+    losses = call(evaluate, data)
+    names, parameters = zip(*loss.named_parameters(), strict=True)
+    gradients = torch.autograd.grad(total(losses), parameters)
+    return losses, dict(zip(names, gradients, strict=True))

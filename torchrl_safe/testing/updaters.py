@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import torch
@@ -111,8 +112,9 @@ def _check_restored(make_updater: MakeUpdater, init: float) -> None:
     costs = torch.rand(6, 3, 2, generator=torch.Generator().manual_seed(0)) * 8
     for batch in costs[:3]:
         saved.step(batch)
-    loaded.load_state_dict(saved.state_dict())
-    loaded.loss_module.load_state_dict(saved.loss_module.state_dict())
+    # As from a file: the state of torch's optimizers is not a copy.
+    loaded.loss_module.load_state_dict(copy.deepcopy(saved.loss_module.state_dict()))
+    loaded.load_state_dict(copy.deepcopy(saved.state_dict()))
     for batch in costs[3:]:
         for updater in (saved, loaded):
             updater.step(batch)
