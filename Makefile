@@ -11,7 +11,7 @@ NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_optimum cost_ga
 	pid_control ppo_lagrangian sac_lagrangian trust_region trust_region_loss trust_region_optimum \
 	trust_region_step violation))
 
-.PHONY: train test test-kernels test-slow compare paper sweep profile gallery bench ray docs lint format type clean
+.PHONY: train test test-kernels test-slow compare paper sweep profile gallery bench draws ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -42,6 +42,9 @@ profile: $(READY)  ## return and cost for fixed multipliers; goes on where it wa
 
 bench: $(READY)  ## ratios against the physics floor and other libraries; wants a quiet machine
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
+
+draws: $(READY)  ## starts of every registered combination, without physics: how many find no room
+	$(BIN)/python tests/draws.py $(ARGS)
 
 ray: $(READY)  ## two costs on a Ray cluster; on this machine, or on yours with ARGS="--address auto"
 	$(BIN)/python -m experiments.ray_training $(ARGS)

@@ -725,9 +725,8 @@ def test_one_cost_and_a_cost_critic_are_asked_for(method):
 @pytest.mark.parametrize("method", [CPO(), PCPO()], ids=["cpo", "pcpo"])
 def test_multipliers_beside_a_limit_of_its_own_are_refused(method):
     """The cost would count twice: in the mixed advantage, and in the constraint."""
-    with pytest.raises(
-        ValueError, match=rf"{type(method).__name__}.*lagrange_multiplier.*\[0\.5\]"
-    ):
+    named = rf"{type(method).__name__}.*lagrange_multiplier.*\[0\.5\]"
+    with pytest.raises(ValueError, match=named):
         TrustRegionStep(make_loss(multiplier_init=0.5), method)
     loss = make_loss()
     step, data, before = TrustRegionStep(loss, method), make_data(loss), actor_state(loss)
