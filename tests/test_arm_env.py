@@ -336,8 +336,8 @@ def test_touch_in_the_middle_of_a_control_step_counts(make_env):
         touches = []
         for _ in range(12):
             fine._batch.advance(joints, fingers)
-            touches.append(fine._batch.state().contact_distance.item() <= 0)
-        fine._state = fine._batch.state()
+            touches.append(fine._batch.state(fine._elapsed).contact_distance.item() <= 0)
+        fine._state = fine._batch.state(fine._elapsed)
         assert cost == float(any(touches)), index
         lost += any(touches) and not touches[-1]
     assert lost > 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NoReturn, Protocol, runtime_checkable
 
 import numpy as np
@@ -119,10 +118,9 @@ class ArmState:
             they overlap, infinite where the simulator reports no contact.
         contact_force: largest force between arm and obstacle in any of these substeps: the sum
             of the normal forces at its contact points, N, ``(N, m)``.
+        step: control steps since the episode began, int, ``(N,)``; 0 after a reset.
+        time: simulated time since the episode began, s, ``(N,)``.
         trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
-        step: control steps since the episode began, int, ``(N,)``; 0 after a reset. The
-            environment fills it in; the state of a simulator alone has none, ``(0,)``.
-        time: simulated time since the episode began, s, ``(N,)``, the same.
     """
 
     joint_position: Array
@@ -146,6 +144,6 @@ class ArmState:
     obstacle_size: Array
     contact_distance: Array
     contact_force: Array
+    step: NDArray[np.int_]
+    time: Array
     trace: Mapping[str, Array] = field(default_factory=Trace)
-    step: NDArray[np.int_] = field(default_factory=partial(np.zeros, 0, int))
-    time: Array = field(default_factory=partial(np.zeros, 0))
