@@ -6,6 +6,7 @@ import pytest
 import torch
 from networks import make_batch, make_critic
 from tensordict import TensorDict
+from torchrl.data import MultiStep
 from torchrl.objectives.value import MultiAgentGAE
 
 from torchrl_safe.objectives import CostGAE
@@ -307,3 +308,14 @@ def test_a_signal_that_fits_no_axis_is_refused(key, shape, message):
     batch["next", key] = torch.zeros(shape, dtype=batch["next", key].dtype)
     with pytest.raises(ValueError, match=message):
         make_gae()(batch)
+
+
+@pytest.mark.parametrize("num_costs", [1, 2])
+def test_sums_of_several_steps_are_refused(num_costs):
+    """TorchRL's GAE adds them up once more; with several costs it names neither key nor reason."""
+    postproc = MultiStep(gamma=GAMMA, n_steps=2)
+    postproc.reward_keys = ("reward", "cost")
+    batch = postproc(with_values(num_costs))
+    for call in (make_gae(), make_gae().value_estimate):
+        with pytest.raises(ValueError, match="'steps_to_next_obs' is in the batch, which a multi"):
+            call(batch)

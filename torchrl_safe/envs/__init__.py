@@ -43,7 +43,7 @@ from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
-from torchrl_safe.envs.transforms import CostToReward
+from torchrl_safe.envs.transforms import CostToReward, FrameSkip
 
 __all__ = [
     "IIWA",
@@ -71,6 +71,7 @@ __all__ = [
     "Cylinder",
     "DampedLeastSquares",
     "EarlyTermination",
+    "FrameSkip",
     "FullObservation",
     "Gripper",
     "Human",

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.value import GAE
@@ -45,7 +46,8 @@ class CostGAE(GAE):
 
     Raises:
         ValueError: if ``gamma`` or ``lmbda`` is out of its range; in a call, if the cost,
-            ``done`` or ``terminated`` of a batch does not fit the shape of its value.
+            ``done`` or ``terminated`` of a batch does not fit the shape of its value, or the
+            batch has n-step sums (``"steps_to_next_obs"``), which GAE cannot be made of.
 
     Examples:
         >>> import torch
@@ -113,6 +115,23 @@ class CostGAE(GAE):
     def vectorized(self, value: bool | None) -> None:
         self._vectorized = value
 
+    @dispatch
+    def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
+        self._check_single_steps(tensordict)
+        return super().forward(tensordict, *args, **kwargs)
+
+    def value_estimate(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Tensor:
+        self._check_single_steps(tensordict)
+        return super().value_estimate(tensordict, *args, **kwargs)
+
+    def _check_single_steps(self, tensordict: TensorDictBase) -> None:
+        # The recursion goes on with the next step, which the sum already contains.
+        if tensordict.get(key := self.tensor_keys.steps_to_next_obs, None) is not None:
+            raise ValueError(
+                f"{key!r} is in the batch, which a multi-step transform has put there: GAE wants "
+                "the rewards and costs of single steps, and sums them itself."
+            )
+
     def _prepare_signals(
         self, reward: Tensor, done: Tensor, terminated: Tensor, value: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -140,10 +159,10 @@ class CostGAE(GAE):
         if signal.shape == (*value.shape[:-2], 1):
             signal = signal.unsqueeze(-2)
         elif signal.shape not in ((*value.shape[:-1], 1), value.shape):
+            own, shared = (*value.shape[:-1], 1), (*value.shape[:-2], 1)
             raise ValueError(
-                f"{key!r} must have the shape {(*value.shape[:-1], 1)}, or {(*value.shape[:-2], 1)} "
-                f"if agents share it, where {self.tensor_keys.value!r} has {tuple(value.shape)}, "
-                f"got {tuple(signal.shape)}."
+                f"{key!r} must have the shape {own}, or {shared} if agents share it, where "
+                f"{self.tensor_keys.value!r} has {tuple(value.shape)}, got {tuple(signal.shape)}."
             )
         return signal.expand_as(value)
 
