@@ -27,6 +27,7 @@ from torchrl_safe.envs.costs import (
     Workspace,
 )
 from torchrl_safe.envs.early_termination import EarlyTermination
+from torchrl_safe.envs.frame_skip import FrameSkip
 from torchrl_safe.envs.human import Human
 from torchrl_safe.envs.kinematics import (
     BulletInverseKinematics,
@@ -43,7 +44,7 @@ from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
-from torchrl_safe.envs.transforms import CostToReward, FrameSkip
+from torchrl_safe.envs.transforms import CostToReward
 
 __all__ = [
     "IIWA",
