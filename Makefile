@@ -5,7 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow compare paper sweep profile gallery bench draws ray docs lint format type clean
+.PHONY: train test test-slow test-wheel compare paper sweep profile gallery bench draws ray docs lint \
+	format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -16,6 +17,9 @@ test: $(READY)  ## everything but the slow tests, on two cores
 
 test-slow: $(READY)  ## every combination, and the tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m slow $(ARGS)
+
+test-wheel:  ## the package as people get it: an empty environment, with and without the arms
+	PYTHON=$(PYTHON) .ci/test-wheel
 
 compare: $(READY)  ## every algorithm on the same task; goes on where it was stopped
 	$(BIN)/python -m experiments.compare $(ARGS)
