@@ -4,8 +4,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# Safety-Gymnasium pins an older Gymnasium and MuJoCo than ours.
+SAFETY := .venv-safety-gymnasium
+SAFETY_FILES := $(addprefix tests/safety_gymnasium/,requirements.txt make_importable.py)
 
-.PHONY: train test test-slow compare paper sweep profile gallery bench ray docs lint format type clean
+.PHONY: train test test-slow test-safety-gymnasium compare paper sweep profile gallery bench ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -16,6 +19,9 @@ test: $(READY)  ## everything but the slow tests, on two cores
 
 test-slow: $(READY)  ## every combination, and the tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m slow $(ARGS)
+
+test-safety-gymnasium: $(SAFETY)/.ready  ## with Safety-Gymnasium itself, in an environment of its own
+	OMP_NUM_THREADS=1 $(SAFETY)/bin/pytest tests/safety_gymnasium $(ARGS)
 
 compare: $(READY)  ## every algorithm on the same task; goes on where it was stopped
 	$(BIN)/python -m experiments.compare $(ARGS)
@@ -54,9 +60,16 @@ type: $(READY)
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) runs docs/_build docs/tutorials
+	rm -rf $(VENV) $(SAFETY) runs docs/_build docs/tutorials
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+$(SAFETY)/.ready: pyproject.toml constraints.txt $(SAFETY_FILES)
+	$(PYTHON) -m venv $(SAFETY)
+	$(SAFETY)/bin/pip install --quiet --constraint constraints.txt --editable . pytest
+	$(SAFETY)/bin/pip install --quiet --no-deps --requirement tests/safety_gymnasium/requirements.txt
+	$(SAFETY)/bin/python tests/safety_gymnasium/make_importable.py
 	touch $@

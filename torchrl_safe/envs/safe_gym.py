@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
@@ -60,7 +61,8 @@ class _CostBesideReward(GymWrapper):
             shape=self.batch_size,
         )
         self._cost = np.zeros(self.full_reward_spec["cost"].shape)
-        self._started: Any = None
+        # Which environments have reset themselves in the last step, and all their observations.
+        self._started: tuple[NDArray[np.bool_], Any] | None = None
         self._vectorized = self._is_batched
         self._resets_itself = self._vectorized and autoreset.resets_itself(self._env)
 
@@ -93,14 +95,18 @@ class _CostBesideReward(GymWrapper):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
+        started, self._started = self._started, None
+        if started is not None and mask is not None and not kwargs:
+            done, observation = started
+            if np.array_equal(mask.numpy(force=True).reshape(done.shape), done):
+                source = self.read_obs(observation)
+                return TensorDict(source, self.batch_size, device=self.device)
         if not self._resets_itself or mask is None or mask.all():
             return super()._reset(tensordict, **kwargs)
-        if self._started is None:
-            raise RuntimeError(
-                "They reset themselves: only environments that are done can be reset apart "
-                "from the others."
-            )
-        return TensorDict(self.read_obs(self._started), self.batch_size, device=self.device)
+        raise RuntimeError(
+            "They reset themselves: only environments that are done can be reset apart from the "
+            "others."
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._action_of(tensordict)
@@ -139,8 +145,9 @@ class _CostBesideReward(GymWrapper):
         # Safety-Gymnasium returns the cost between the reward and the flags.
         observation, reward, *cost, terminated, truncated, info = step_outputs_tuple
         done = terminated | truncated
+        self._started = None
         if self._resets_itself and done.any():
-            self._started = observation
+            self._started = done, observation
             observation = autoreset.last_observation(self._env, observation, info, done)
             info = autoreset.last_info(info, done)
         for column, path in enumerate(self._cost_paths):
@@ -187,7 +194,8 @@ class SafeGymWrapper(_CostBesideReward):
     are six, as in Safety-Gymnasium. ``reset`` returns none.
 
     Vectorized environments may reset in the modes that TorchRL supports, ``DISABLED`` and
-    ``SAME_STEP``; the last observation, reward and cost of an episode are the true ones in both.
+    ``SAME_STEP``; the last observation, reward and cost of an episode are the true ones in both,
+    and in the vectorized environments of Gymnasium 0.28 and Safety-Gymnasium, which know no modes.
     Gymnasium gives an entry of a vectorized info the type it has in the first environment: a cost
     must be a float everywhere, or its fractions are lost.
 
@@ -221,7 +229,8 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
     As :class:`SafeGymWrapper`, with the name of a registered environment.
 
     Args:
-        env_name (str): name in Gymnasium's registry.
+        env_name (str): name in Gymnasium's registry, or of Safety-Gymnasium, which is imported
+            for it: ``"SafetyPointGoal1-v0"``, ``"SafetyPointGoal1Gymnasium-v0"``.
 
     Keyword Args:
         cost_keys (Sequence[NestedKey], optional): the entries of ``info`` that are costs.

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from types import ModuleType
 
 import gymnasium
+from gymnasium.vector import AsyncVectorEnv
 
 _MODULE = "safety_gymnasium"
 
@@ -29,7 +30,9 @@ def find_maker(env_name: str) -> tuple[ModuleType, str]:
     return gymnasium, f"{_MODULE}:{name}" if name in gymnasium.registry else env_name
 
 
-def async_vector_env(factories: Sequence[Callable[[], gymnasium.Env]]) -> gymnasium.vector.VectorEnv:
+def async_vector_env(
+    factories: Sequence[Callable[[], gymnasium.Env]],
+) -> gymnasium.vector.VectorEnv:
     """A process for each environment whose ``step`` returns six values."""
     from safety_gymnasium.vector import SafetyAsyncVectorEnv
 
