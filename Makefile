@@ -8,7 +8,8 @@ READY := $(VENV)/.ready
 SAFETY := .venv-safety-gymnasium
 SAFETY_FILES := $(addprefix tests/safety_gymnasium/,requirements.txt make_importable.py)
 
-.PHONY: train test test-slow test-safety-gymnasium compare paper sweep profile gallery bench ray docs lint format type clean
+.PHONY: train test test-slow test-wheel test-safety-gymnasium compare paper sweep profile gallery bench \
+	draws ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -22,6 +23,9 @@ test-slow: $(READY)  ## every combination, and the tests that train for minutes
 
 test-safety-gymnasium: $(SAFETY)/.ready  ## with Safety-Gymnasium itself, in an environment of its own
 	OMP_NUM_THREADS=1 $(SAFETY)/bin/pytest tests/safety_gymnasium $(ARGS)
+
+test-wheel:  ## the package as people get it: an empty environment, with and without the arms
+	PYTHON=$(PYTHON) .ci/test-wheel
 
 compare: $(READY)  ## every algorithm on the same task; goes on where it was stopped
 	$(BIN)/python -m experiments.compare $(ARGS)
@@ -37,6 +41,9 @@ profile: $(READY)  ## return and cost for fixed multipliers; goes on where it wa
 
 bench: $(READY)  ## ratios against the physics floor and other libraries; wants a quiet machine
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
+
+draws: $(READY)  ## starts of every registered combination, without physics: how many find no room
+	$(BIN)/python tests/draws.py $(ARGS)
 
 ray: $(READY)  ## two costs on a Ray cluster; on this machine, or on yours with ARGS="--address auto"
 	$(BIN)/python -m experiments.ray_training $(ARGS)
