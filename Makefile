@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 # Safety-Gymnasium pins an older Gymnasium and MuJoCo than ours.
 SAFETY := .venv-safety-gymnasium
-SAFETY_FILES := $(addprefix tests/safety_gymnasium/,requirements.txt make_importable.py)
+SAFETY_FILES := $(addprefix tests/with_safety_gymnasium/,requirements.txt make_importable.py)
 
 .PHONY: train test test-slow test-wheel test-safety-gymnasium compare paper sweep profile gallery bench \
 	draws ray docs lint format type clean
@@ -22,7 +22,7 @@ test-slow: $(READY)  ## every combination, and the tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m slow $(ARGS)
 
 test-safety-gymnasium: $(SAFETY)/.ready  ## with Safety-Gymnasium itself, in an environment of its own
-	OMP_NUM_THREADS=1 $(SAFETY)/bin/pytest tests/safety_gymnasium $(ARGS)
+	OMP_NUM_THREADS=1 $(SAFETY)/bin/pytest tests/with_safety_gymnasium $(ARGS)
 
 test-wheel:  ## the package as people get it: an empty environment, with and without the arms
 	PYTHON=$(PYTHON) .ci/test-wheel
@@ -77,6 +77,6 @@ $(READY): pyproject.toml constraints.txt
 $(SAFETY)/.ready: pyproject.toml constraints.txt $(SAFETY_FILES)
 	$(PYTHON) -m venv $(SAFETY)
 	$(SAFETY)/bin/pip install --quiet --constraint constraints.txt --editable . pytest
-	$(SAFETY)/bin/pip install --quiet --no-deps --requirement tests/safety_gymnasium/requirements.txt
-	$(SAFETY)/bin/python tests/safety_gymnasium/make_importable.py
+	$(SAFETY)/bin/pip install --quiet --no-deps --requirement tests/with_safety_gymnasium/requirements.txt
+	$(SAFETY)/bin/python tests/with_safety_gymnasium/make_importable.py
 	touch $@

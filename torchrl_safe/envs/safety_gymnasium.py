@@ -7,7 +7,6 @@ from importlib.util import find_spec
 from types import ModuleType
 
 import gymnasium
-from gymnasium.vector import AsyncVectorEnv
 
 _MODULE = "safety_gymnasium"
 
