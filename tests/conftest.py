@@ -3,6 +3,7 @@
 import multiprocessing
 
 import pytest
+import torch
 from worlds import turntable_settings
 
 
@@ -35,3 +36,9 @@ def forked_workers():
     multiprocessing.set_start_method("fork", force=True)
     yield
     multiprocessing.set_start_method(before, force=True)
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    """Numbers that a test draws do not depend on the tests before it."""
+    torch.manual_seed(0)

@@ -106,7 +106,7 @@ def test_readme_recipes(tmp_path):
 def test_environments(tmp_path):
     """Each block runs by itself, and each environment in it is one."""
     blocks = code_of("docs/environments.md")
-    assert len(blocks) == 6
+    assert len(blocks) == 7
     script = tmp_path / "environments.py"
     check = "env.reset()\nenv.close()\n"
     script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")
@@ -168,6 +168,22 @@ def test_trainers(tmp_path):
     assert int(step) == 1280
     assert float(shown[0]) == pytest.approx(max(0, 0.2 * (float(cost) - 0.5)), abs=0.01)
     assert (tmp_path / "runs" / "checkpoint").exists()
+
+
+def test_testing(tmp_path):
+    """A loss that a user wrote passes all checks but the one that it is said to fail."""
+    own, failing, every, rule = code_of("docs/testing.md")
+    assert len(own.splitlines()) < 30
+    script = tmp_path / "own.py"
+    caught = (
+        f"try:\n    {failing.splitlines()[0]}\nexcept AssertionError as error:\n    print(error)\n"
+    )
+    # The doctest of check_loss runs the call.
+    *imports, _ = every.splitlines()
+    script.write_text("\n".join([own, caught, *imports, rule]), encoding="utf-8")
+    shown = run(script)
+    expected = failing.splitlines()[1].removeprefix("# AssertionError: ").removesuffix(" ...")
+    assert shown.startswith(expected)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda p: p.stem)

@@ -27,6 +27,8 @@ from torchrl_safe.envs.costs import (
     Workspace,
 )
 from torchrl_safe.envs.early_termination import EarlyTermination
+from torchrl_safe.envs.frame_skip import FrameSkip
+from torchrl_safe.envs.home import find_home
 from torchrl_safe.envs.human import Human
 from torchrl_safe.envs.kinematics import (
     BulletInverseKinematics,
@@ -71,6 +73,7 @@ __all__ = [
     "Cylinder",
     "DampedLeastSquares",
     "EarlyTermination",
+    "FrameSkip",
     "FullObservation",
     "Gripper",
     "Human",
@@ -103,6 +106,7 @@ __all__ = [
     "Task",
     "Workspace",
     "World",
+    "find_home",
     "paper_env",
     "paper_observation",
 ]

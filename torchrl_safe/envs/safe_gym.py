@@ -6,7 +6,8 @@ Import from :mod:`torchrl_safe.envs.gym`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from types import ModuleType
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -252,8 +253,9 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
         super().__init__(env_name, **{"backend": "gymnasium", **kwargs})
 
     @property
-    def lib(self) -> ModuleType:
-        return self._maker
+    def lib(self) -> Any:
+        # All that TorchRL 0.14.1 takes from it is `make`.
+        return SimpleNamespace(make=partial(_make, self._maker.make))
 
     def _build_env(self, env_name: str, **kwargs: Any) -> Any:
         self._maker, name = safety_gymnasium.find_maker(env_name)
@@ -263,3 +265,14 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
         if self._maker is gymnasium:
             return autoreset.async_vector_env(factories)
         return safety_gymnasium.async_vector_env(factories)
+
+
+def _make(make: Callable[..., gymnasium.Env], env_name: str, **kwargs: Any) -> gymnasium.Env:
+    try:
+        return make(env_name, **kwargs)
+    except TypeError as error:
+        # TorchRL tries an argument of this name, and then without it if the error says so. A class
+        # without a constructor of its own says only that it takes none.
+        if "frameskip" in kwargs and "takes no arguments" in str(error):
+            raise TypeError("unexpected keyword argument 'frameskip'") from error
+        raise
