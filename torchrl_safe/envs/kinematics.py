@@ -113,7 +113,7 @@ class Approach(NamedTuple):
 
 def approach(
     world: World,
-    start: Sequence[float],
+    start: Sequence[float] | Array,
     position: Array,
     orientation: Array | None = None,
     *,
