@@ -1,4 +1,4 @@
-"""What a constrained on-policy loss needs beside its parent: a critic of the costs."""
+"""A critic of k costs beside an on-policy loss: network, keys, estimator, loss."""
 
 from __future__ import annotations
 
@@ -8,19 +8,26 @@ from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, dispatch
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictParams,
+)
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
-from torchrl.objectives.utils import _clip_value_loss, _get_default_device, distance_loss
+from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives.cost_gae import CostGAE, centred
+from torchrl_safe.objectives._reduction import counted, reduced
+from torchrl_safe.objectives.cost_gae import CostGAE
+from torchrl_safe.objectives.functional import scaled_advantages
 
-Self = TypeVar("Self", bound="CostCriticMixin")
+Self = TypeVar("Self", bound="CostCritic")
 
 
 @dataclass
@@ -33,17 +40,16 @@ class CostKeys:
     cost_value_target: NestedKey = "cost_value_target"
 
 
-class CostCriticMixin(LossModule):
-    """Adds a critic of k costs, its advantages and its loss to an on-policy loss.
+class CostCritic(LossModule):
+    """Adds a critic of k costs, its advantages and its loss to an on-policy loss of TorchRL.
 
-    It stands before a TorchRL loss among the bases, whose constructor gets all arguments but
-    ``cost_critic_network``, ``num_costs`` and ``cost_critic_coeff``. The final class declares
-    ``_AcceptedKeys(CostKeys, Parent._AcceptedKeys)`` and ``default_keys``. Of the parent are
-    read ``actor_network``, ``functional``, ``separate_losses``, ``clip_value``,
-    ``loss_critic_type`` and, where it has that option, ``log_explained_variance``.
+    It stands before that loss among the bases, whose constructor gets all arguments but
+    ``cost_critic_network``, ``num_costs`` and ``cost_critic_coeff``. The class that joins the two
+    declares ``_AcceptedKeys(CostKeys, ...)`` and ``default_keys``. Of the loss are read its
+    networks, ``functional``, ``separate_losses``, ``reduction``, ``clip_value``,
+    ``loss_critic_type``, ``log_explained_variance``, ``advantage_norm`` and
+    ``normalize_advantage_exclude_dims``.
     """
-
-    log_explained_variance = True
 
     _schedulable_buffers = frozenset({"cost_critic_coeff"})
 
@@ -51,7 +57,6 @@ class CostCriticMixin(LossModule):
     cost_critic_network_params: TensorDictParams
     target_cost_critic_network_params: TensorDictParams
     cost_critic_coeff: Tensor
-    _out_keys: list[NestedKey] | None
 
     def __init__(
         self,
@@ -64,9 +69,12 @@ class CostCriticMixin(LossModule):
     ) -> None:
         check_count(num_costs=num_costs)
         cost_critic_coeff = check_number("cost_critic_coeff", cost_critic_coeff)
-        # The parent's constructor already asks for in_keys, before a module can be assigned.
+        # The parent's constructor already sets keys, before a module can be assigned.
         self._cost_critic_in_keys = list(cost_critic_network.in_keys)
         self._cost_value_estimator: ValueEstimatorBase | None = None
+        self._listed_in_keys: list[NestedKey] = []
+        self._selected_out_keys: list[NestedKey] | None = None
+        self._shared_keys: list[NestedKey] = []
         if device is not None:
             kwargs["device"] = device
         super().__init__(*args, **kwargs)
@@ -80,10 +88,13 @@ class CostCriticMixin(LossModule):
             self.cost_critic_network = cost_critic_network
             self.cost_critic_network_params = None
             self.target_cost_critic_network_params = None
-        device = _get_default_device(self) if device is None else device
+        if device is None:
+            device = next((p.device for p in self.parameters()), torch.get_default_device())
         self.register_coeff_buffer("cost_critic_coeff", cost_critic_coeff, device=device)
         self.register_state_dict_pre_hook(build_value_estimators)
         self.register_load_state_dict_pre_hook(build_value_estimators)
+        self._shared_keys = _written_by_actor(self)
+        self._list_in_keys()
 
     def make_cost_value_estimator(
         self: Self, estimator: ValueEstimatorBase | None = None, **hyperparams: Any
@@ -117,7 +128,7 @@ class CostCriticMixin(LossModule):
             )
         self._check_cost_value_estimator(estimator)
         self._cost_value_estimator = estimator
-        self._forward_value_estimator_keys()
+        self._set_cost_estimator_keys()
         return self
 
     def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
@@ -134,9 +145,12 @@ class CostCriticMixin(LossModule):
     def estimate_advantages(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes advantages and value targets of reward and costs, for a whole batch.
 
-        The reward advantage is standardized to mean 0 and standard deviation 1, the cost
-        advantages are centred only, all over the whole batch. Steps that the loss leaves out, as
-        those that pad a trajectory (``("collector", "mask")``), do not count.
+        They are scaled over the whole batch, as
+        :func:`~torchrl_safe.objectives.functional.scaled_advantages` says: the reward advantage is
+        standardized (unless the loss has an ``advantage_norm``, which scales it instead), the cost
+        advantages are centred (by ``CostGAE``; another estimator decides for itself). Steps that
+        the loss leaves out, such as those that pad a trajectory (``("collector", "mask")``), do
+        not count. A call of the loss with a batch without advantages does the same first.
 
         Args:
             tensordict (TensorDictBase): a batch as collectors return it, shape ``(*B, T)``.
@@ -149,43 +163,62 @@ class CostCriticMixin(LossModule):
             KeyError: if the batch has no cost.
         """
         with set_recurrent_mode(True):  # As TorchRL has it around a loss.
-            self._estimate_advantage(tensordict)
-            advantage = tensordict.get(self.tensor_keys.advantage)
-            if advantage.numel() > 1:
-                # Where TorchRL's looks for what counts.
-                counted = tensordict.select()
-                if (mask := self._mask(tensordict, advantage)) is not None:
-                    counted.set("shifted_valid", mask)
-                advantage = self._standardize_advantage(advantage, counted)
-            tensordict.set(self.tensor_keys.advantage, advantage)
-            return self._estimate_cost_advantage(tensordict)
+            self._estimate_advantages(tensordict)
+        return tensordict
 
-    def _mask(self, tensordict: TensorDictBase, values: Tensor) -> Tensor | None:
-        """The steps that the loss counts, expanded to the values, or None if all."""
-        found = (tensordict.get(key, None) for key in self._loss_mask_keys())
-        masks = [self._expand_loss_mask(mask, values) for mask in found if mask is not None]
-        return torch.stack(masks).all(0) if masks else None
-
-    def _estimate_advantage(self, tensordict: TensorDictBase) -> None:
+    def _estimate_advantages(self, tensordict: TensorDictBase) -> None:
+        keys = self.tensor_keys
+        cost_key = unravel_key(("next", keys.cost))
+        self._check_width(cost_key, get_or_raise(tensordict, cost_key))
+        data = self._with_features(tensordict)
         self.value_estimator(
-            tensordict,
+            data,
             params=self.critic_network_params.detach() if self.functional else None,
             target_params=self.target_critic_network_params,
         )
-
-    def _estimate_cost_advantage(self, tensordict: TensorDictBase) -> TensorDictBase:
-        key, estimator = unravel_key(("next", self.tensor_keys.cost)), self.cost_value_estimator
-        self._check_width(key, get_or_raise(tensordict, key))
-        tensordict = estimator(
-            tensordict,
+        estimator = self.cost_value_estimator
+        estimator(
+            data,
             params=self.cost_critic_network_params.detach() if self.functional else None,
             target_params=self.target_cost_critic_network_params,
         )
-        advantage = tensordict.get(self.tensor_keys.cost_advantage)
-        mask = self._mask(tensordict, advantage)
-        if mask is not None and isinstance(estimator, CostGAE) and estimator.average_gae:
-            tensordict.set(self.tensor_keys.cost_advantage, centred(advantage, mask))
-        return tensordict
+        cost_advantage = data.get(keys.cost_advantage)
+        mask = counted(self, data, cost_advantage)
+        advantage, cost_advantage = scaled_advantages(
+            data.get(keys.advantage),
+            cost_advantage,
+            counted=None if mask is None else mask[..., :1],
+            standardize=self.advantage_norm is None,
+            # CostGAE has done so already, over every step: that is over too many under a mask.
+            centre=mask is not None and isinstance(estimator, CostGAE) and estimator.average_gae,
+            exclude_dims=self.normalize_advantage_exclude_dims,
+        )
+        data.set(keys.advantage, advantage)
+        data.set(keys.cost_advantage, cost_advantage)
+        if data is not tensordict:
+            hidden = [*self._shared_keys, *(unravel_key(("next", k)) for k in self._shared_keys)]
+            tensordict.update(data.exclude(*hidden))
+
+    def actor_features(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """What the critics read of the actor, computed anew; empty if they read nothing of it."""
+        if not self._shared_keys:
+            return tensordict.empty()
+        trunk = self.actor_network.det_part.select_subsequence(out_keys=self._shared_keys)
+        with (
+            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
+            if self.functional
+            else contextlib.nullcontext()
+        ):
+            return trunk(tensordict.select(*trunk.in_keys)).select(*self._shared_keys)
+
+    def _with_features(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The batch, with the inputs of critics that are heads of the actor's network."""
+        if not self._shared_keys:
+            return tensordict
+        data = tensordict.clone(False)
+        for part in (data, data.get("next")):
+            part.update(self.actor_features(part))
+        return data
 
     def _check_width(self, key: NestedKey, values: Tensor) -> None:
         if values.shape[-1] != self.num_costs:
@@ -230,8 +263,12 @@ class CostCriticMixin(LossModule):
         loss = distance_loss(target, value, loss_function=self.loss_critic_type)
         clip_fraction = None
         if old_value is not None:
-            loss, clip_fraction = _clip_value_loss(
-                old_value, value, self.clip_value, target, loss, self.loss_critic_type
+            moved = value - old_value
+            clipped = moved.clamp(-self.clip_value, self.clip_value)
+            clip_fraction = (moved != clipped).to(value.dtype).mean()
+            loss = torch.maximum(
+                loss,
+                distance_loss(target, old_value + clipped, loss_function=self.loss_critic_type),
             )
         explained_variance = None
         if self.log_explained_variance:
@@ -242,21 +279,6 @@ class CostCriticMixin(LossModule):
         # Summed, not averaged: each critic column then learns as fast with k costs as with one.
         loss = self.cost_critic_coeff * loss.sum(-1, keepdim=True)
         return loss, clip_fraction, explained_variance
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = tensordict.clone(False)
-        if not self._has_advantages(tensordict):
-            self._estimate_cost_advantage(tensordict)
-        losses = super().forward(tensordict)
-        self._set_cost_outputs(losses, tensordict)
-        self._clear_weakrefs(
-            tensordict,
-            losses,
-            "cost_critic_network_params",
-            "target_cost_critic_network_params",
-        )
-        return losses
 
     def _has_advantages(self, tensordict: TensorDictBase) -> bool:
         """Whether both are there. One alone would be joined by one of shuffled steps."""
@@ -269,16 +291,15 @@ class CostCriticMixin(LossModule):
             )
         return not missing
 
-    def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
-        """Adds to the parent's outputs; a loss with more of them extends this and the next."""
+    def _set_cost_critic_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
         loss, clip_fraction, explained_variance = self.loss_cost_critic(tensordict)
-        losses.set("loss_cost_critic", self._reduce_loss(loss, tensordict).squeeze(-1))
+        losses.set("loss_cost_critic", reduced(self, loss, tensordict).squeeze(-1))
         if explained_variance is not None:
             losses.set("cost_explained_variance", explained_variance.mean())
         if clip_fraction is not None:
             losses.set("cost_value_clip_fraction", clip_fraction)
 
-    def _cost_out_keys(self) -> list[NestedKey]:
+    def _own_out_keys(self) -> list[NestedKey]:
         keys: list[NestedKey] = ["loss_cost_critic"]
         if self.log_explained_variance:
             keys.append("cost_explained_variance")
@@ -286,26 +307,40 @@ class CostCriticMixin(LossModule):
             keys.append("cost_value_clip_fraction")
         return keys
 
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        keys = self._cost_critic_in_keys
-        keys = [*keys, *(unravel_key(("next", key)) for key in keys)]
-        keys.append(unravel_key(("next", self.tensor_keys.cost)))
-        self._in_keys += [key for key in dict.fromkeys(keys) if key not in self._in_keys]
-
     @property
     def out_keys(self) -> list[NestedKey]:
-        if self._out_keys is None:
-            # The parent keeps its own list as soon as it is asked for it.
-            self._out_keys = [*super().out_keys, *self._cost_out_keys()]
-        return self._out_keys
+        # Listed at each call, since options can be set later.
+        if self._selected_out_keys is None:
+            return [*super().out_keys, *self._own_out_keys()]
+        return self._selected_out_keys
 
     @out_keys.setter
     def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
+        self._selected_out_keys = values
 
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        super()._forward_value_estimator_keys(**kwargs)
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        # Listed when the keys are set: compiled code reads them at each call.
+        return self._listed_in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._listed_in_keys = values
+
+    def _list_in_keys(self) -> None:
+        keys = [key for key in self._cost_critic_in_keys if key not in self._shared_keys]
+        keys = [*keys, *(unravel_key(("next", key)) for key in keys)]
+        keys.append(unravel_key(("next", self.tensor_keys.cost)))
+        inherited = [unravel_key(key) for key in super().in_keys]
+        self._listed_in_keys = list(dict.fromkeys([*inherited, *keys]))
+
+    def set_keys(self, **kwargs: Any) -> None:
+        """Sets the names of entries, as :meth:`torchrl.objectives.LossModule.set_keys`."""
+        super().set_keys(**kwargs)
+        self._list_in_keys()
+        self._set_cost_estimator_keys()
+
+    def _set_cost_estimator_keys(self) -> None:
         if self._cost_value_estimator is not None:
             self._cost_value_estimator.set_keys(
                 advantage=self.tensor_keys.cost_advantage,
@@ -315,6 +350,17 @@ class CostCriticMixin(LossModule):
                 done=self.tensor_keys.done,
                 terminated=self.tensor_keys.terminated,
             )
+
+
+def _written_by_actor(loss: LossModule) -> list[NestedKey]:
+    """The inputs of the critics that the actor's network computes: the critics are its heads."""
+    actor = loss.actor_network
+    if not isinstance(actor, ProbabilisticTensorDictSequential):
+        return []
+    critics = [loss.critic_network, loss.cost_critic_network]
+    read = [unravel_key(key) for critic in critics if critic is not None for key in critic.in_keys]
+    written = [unravel_key(key) for key in actor.det_part.out_keys]
+    return [key for key in dict.fromkeys(read) if key in written]
 
 
 def get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
@@ -332,6 +378,6 @@ def report_each(losses: TensorDictBase, name: str, values: Tensor) -> None:
         losses.set(f"{name}_{index}", value)
 
 
-def build_value_estimators(loss: CostCriticMixin, *_: Any) -> None:
+def build_value_estimators(loss: CostCritic, *_: Any) -> None:
     # Their buffers are part of the state: a fresh and a used loss then have the same entries.
     _ = loss.value_estimator, loss.cost_value_estimator

@@ -15,12 +15,12 @@ from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
+from torchrl_safe.objectives._constrained import initial_multiplier
 from torchrl_safe.objectives._cost_critic import (
     build_value_estimators,
     get_or_raise,
     report_each,
 )
-from torchrl_safe.objectives._lagrange import initial_multiplier
 from torchrl_safe.objectives.cost_td0 import CostTD0
 from torchrl_safe.objectives.functional import penalized_advantage
 

@@ -1,78 +1,93 @@
-"""An advantage loss of any kind, made constrained by changing the advantage it is given."""
+"""An advantage loss of any kind, held as an object in the place of a parent."""
 
 from __future__ import annotations
 
-import abc
-from dataclasses import fields
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 from tensordict import TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictParams,
-)
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives._cost_critic import CostKeys
+from torchrl_safe.objectives._constrained import evaluate, forward_evaluated
+from torchrl_safe.objectives._cost_critic import CostCritic, CostKeys
 
 _COST_KEYS = frozenset(field.name for field in fields(CostKeys))
+# Options that a ConstrainedLoss reads and that not every loss has.
+_DEFAULTS: dict[str, Any] = {
+    "advantage_norm": None,
+    "log_explained_variance": True,
+    "normalize_advantage_exclude_dims": (),
+}
 
 
 class WrappedLoss(LossModule):
-    """Holds an advantage loss and gives it the advantage that :meth:`_mix` makes.
+    """Holds an advantage loss, and gives it the advantage to maximize.
 
-    It stands behind a :class:`CostCriticMixin` among the bases, in the place of a parent. Keys,
-    options and networks are those of the loss that it holds, and are set here. Target networks are
-    in the loss that it holds: ``SoftUpdate(loss.loss_module)``.
+    It stands behind a :class:`ConstrainedLoss` among the bases, in the place of a parent. Its
+    attributes are those of the loss that it holds, coefficients and networks too: they are read
+    and set there.
     """
 
-    # Whole-batch standardization as PPO has it, for losses that have none.
-    normalize_advantage_exclude_dims = ()
-    _standardize_advantage = PPOLoss._standardize_advantage
-    _out_keys: list[NestedKey] | None = None
+    @dataclass
+    class _AcceptedKeys(CostKeys):
+        pass
+
+    default_keys = _AcceptedKeys
+
+    # Its own, as that of the cost critic may differ from that of the loss.
+    separate_losses = False
 
     def __init__(self, loss_module: LossModule, *, separate_losses: bool = False) -> None:
         _check_wrapped(loss_module)
         if not isinstance(separate_losses, bool):
             raise TypeError(f"separate_losses must be a bool, got {separate_losses!r}.")
         super().__init__()
-        self._in_keys: list[NestedKey] = []
         self.loss_module = loss_module
         self.separate_losses = separate_losses
+        self._both_keys = _BothKeys(self._AcceptedKeys(), loss_module.tensor_keys)
+        # One table for both of who updates target networks, which SoftUpdate writes here and the
+        # loss reads there. There is no public one.
+        self._has_update_associated = loss_module._has_update_associated
 
-    @abc.abstractmethod
-    def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:
-        """The advantage to maximize, of shape ``(*B, 1)``."""
+    def unconstrained(self, tensordict: TensorDictBase, advantage: Tensor) -> TensorDictBase:
+        """The outputs of the loss that is held, for this advantage of shape ``(*B, 1)``."""
+        loss, shared = self.loss_module, self._shared_keys
+        tensordict.set(loss.tensor_keys.advantage, advantage)
+        if shared and isinstance(loss, PPOLoss):
+            # Heads read what one evaluation of the policy leaves; KLPENPPOLoss reads what the
+            # collector has left of it.
+            data = tensordict.clone(False)
+            policy = evaluate(loss, data, advantage.shape[:-1])
+            tensordict.update(data.select(*shared))
+            return forward_evaluated(loss, tensordict.clone(False), policy)
+        losses = loss(tensordict.clone(False))
+        tensordict.update(self.actor_features(tensordict))
+        return losses
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        key = self.loss_module.tensor_keys.advantage
-        if tensordict.get(key, None) is None:
-            self._estimate_advantage(tensordict)
-        mixed = self._mix(tensordict.get(key), tensordict.get(self.tensor_keys.cost_advantage))
-        return self.loss_module(tensordict.clone(False).set(key, mixed))
+    # ---- attributes of the loss that is held
+
+    def __getattr__(self, name: str) -> Any:
+        modules = self.__dict__.get("_modules", {})
+        own = name in modules or name in self.__dict__.get("_buffers", {})
+        if own or "loss_module" not in modules or "cost_critic_network" in name:
+            return super().__getattr__(name)
+        if name in _DEFAULTS:
+            return getattr(modules["loss_module"], name, _DEFAULTS[name])
+        return getattr(modules["loss_module"], name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # A coefficient of the wrapped loss, as schedules set it.
-        modules = self.__dict__.get("_modules", {})
-        inner = modules.get("loss_module")
-        if inner is not None and name in type(inner)._all_schedulable_buffers:
-            setattr(inner, name, value)
-        else:
+        inner = self.__dict__.get("_modules", {}).get("loss_module")
+        own = name in self.__dict__ or name in self.__dict__.get("_buffers", {})
+        if inner is None or own or hasattr(type(self), name) or not hasattr(inner, name):
             super().__setattr__(name, value)
+        else:
+            setattr(inner, name, value)
 
-    @property
-    def value_estimator(self) -> ValueEstimatorBase:
-        """The value estimator of the reward."""
-        return self.loss_module.value_estimator
-
-    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> WrappedLoss:
-        """Chooses the value estimator of the reward: the wrapped loss's method."""
-        self.loss_module.make_value_estimator(value_type, **hyperparams)
-        return self
+    # What LossModule itself has, so that the two above are not asked.
 
     @property
     def functional(self) -> bool:
@@ -80,44 +95,18 @@ class WrappedLoss(LossModule):
         return self.loss_module.functional
 
     @property
-    def actor_network(self) -> ProbabilisticTensorDictSequential:
-        """The policy of the wrapped loss."""
-        return self.loss_module.actor_network
+    def value_estimator(self) -> ValueEstimatorBase:
+        """The value estimator of the reward."""
+        return self.loss_module.value_estimator
 
-    @property
-    def actor_network_params(self) -> TensorDictParams:
-        """The parameters of the wrapped loss's policy."""
-        return self.loss_module.actor_network_params
+    @value_estimator.setter
+    def value_estimator(self, value: ValueEstimatorBase) -> None:
+        self.loss_module.value_estimator = value
 
-    @property
-    def critic_network(self) -> TensorDictModule:
-        """The critic of the wrapped loss."""
-        return self.loss_module.critic_network
-
-    @property
-    def critic_network_params(self) -> TensorDictParams:
-        """The parameters of the wrapped loss's critic."""
-        return self.loss_module.critic_network_params
-
-    @property
-    def target_critic_network_params(self) -> TensorDictParams:
-        """The target parameters of the wrapped loss's critic."""
-        return self.loss_module.target_critic_network_params
-
-    @property
-    def reduction(self) -> str:
-        """The reduction of the wrapped loss."""
-        return self.loss_module.reduction
-
-    @property
-    def clip_value(self) -> Tensor | None:
-        """The range of value clipping of the wrapped loss."""
-        return self.loss_module.clip_value
-
-    @property
-    def loss_critic_type(self) -> str:
-        """The distance that the wrapped loss trains its critic with."""
-        return self.loss_module.loss_critic_type
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> WrappedLoss:
+        """Chooses the value estimator of the reward: the wrapped loss's method."""
+        self.loss_module.make_value_estimator(value_type, **hyperparams)
+        return self
 
     @property
     def loss_mask_key(self) -> NestedKey | Literal["auto"] | None:
@@ -128,42 +117,39 @@ class WrappedLoss(LossModule):
     def loss_mask_key(self, value: NestedKey | Literal["auto"] | None) -> None:
         self.loss_module.loss_mask_key = value
 
-    def _loss_mask_keys(self) -> tuple[NestedKey, ...]:
-        return self.loss_module._loss_mask_keys()
+    def reset(self) -> None:
+        """Resets the wrapped loss."""
+        self.loss_module.reset()
 
     def reset_parameters_recursive(self) -> None:
         """Reset the parameters of the module."""
         super().reset_parameters_recursive()
         self.loss_module.reset_parameters_recursive()
 
+    def named_children(self) -> Iterator[tuple[str, nn.Module]]:
+        """The modules held, and the target networks of the wrapped loss, for ``SoftUpdate``."""
+        yield from super().named_children()
+        for name, module in self.loss_module.named_children():
+            if name.startswith("target_"):
+                yield name, module
+
+    # ---- keys
+
     @property
     def tensor_keys(self) -> _BothKeys:
         """The keys of the wrapped loss and those of the costs."""
-        return _BothKeys(self._tensor_keys, self.loss_module.tensor_keys)
+        return self._both_keys
 
     def set_keys(self, **kwargs: Any) -> None:
         """Sets keys of the costs here, and all others in the wrapped loss."""
         self.loss_module.set_keys(**{k: v for k, v in kwargs.items() if k not in _COST_KEYS})
         for name in _COST_KEYS & kwargs.keys():
             key = kwargs[name]
-            setattr(self._tensor_keys, name, getattr(CostKeys(), name) if key is None else key)
-        self._forward_value_estimator_keys()
-
-    def _set_in_keys(self) -> None:
-        self._in_keys = [unravel_key(key) for key in self.loss_module.in_keys]
-
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        self._set_in_keys()
+            setattr(self.tensor_keys, name, getattr(CostKeys(), name) if key is None else key)
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        if not self._in_keys:
-            self._set_in_keys()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        return [unravel_key(key) for key in self.loss_module.in_keys]
 
     @property
     def out_keys(self) -> list[NestedKey]:
@@ -187,6 +173,10 @@ class _BothKeys:
 def _check_wrapped(loss_module: LossModule) -> None:
     if not isinstance(loss_module, LossModule):
         raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
+    if isinstance(loss_module, CostCritic):
+        raise ValueError(
+            f"loss_module must be a loss without costs, got {type(loss_module).__name__}."
+        )
     if "advantage" not in type(loss_module)._AcceptedKeys.__dataclass_fields__:
         raise ValueError(
             f"loss_module must be a loss that reads an advantage, got {type(loss_module).__name__}."

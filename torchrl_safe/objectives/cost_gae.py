@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives._checks import check_share
+from torchrl_safe.objectives.functional import centred
 
 
 class CostGAE(GAE):
@@ -127,12 +127,3 @@ class CostGAE(GAE):
         self, adv: Tensor, valid: Tensor | None = None, groups: Tensor | None = None
     ) -> Tensor:
         return centred(adv, None if valid is None else self._expand_to_match(valid, adv))
-
-
-def centred(values: Tensor, valid: Tensor | None) -> Tensor:
-    """Takes off the mean of each column, over the rows that are valid."""
-    rows = tuple(range(values.ndim - 1))
-    if valid is None:
-        return values - values.mean(rows, keepdim=True)
-    count = valid.sum(rows, keepdim=True).clamp_min(1)
-    return values - torch.where(valid, values, 0.0).sum(rows, keepdim=True) / count

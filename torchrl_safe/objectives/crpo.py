@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._cost_critic import CostKeys
+from torchrl_safe.objectives._constrained import ConstrainedLoss
 from torchrl_safe.objectives._wrapped import WrappedLoss
-from torchrl_safe.objectives.violation import ViolationMixin
 
 
 def rectified_advantage(
@@ -65,7 +63,7 @@ def rectified_advantage(
     return torch.where(violation.max() > tolerance, -worst, advantage)
 
 
-class CRPOLoss(ViolationMixin, WrappedLoss):
+class CRPOLoss(ConstrainedLoss, WrappedLoss):
     r"""Gives an advantage loss the reward, or the cost whose limit is exceeded most.
 
     Presented in "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
@@ -148,13 +146,9 @@ class CRPOLoss(ViolationMixin, WrappedLoss):
 
     _schedulable_buffers = frozenset({"tolerance"})
 
+    cost_buffers = ("cost_violation",)
+
     tolerance: Tensor
-
-    @dataclass
-    class _AcceptedKeys(CostKeys):
-        pass
-
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,
@@ -176,5 +170,10 @@ class CRPOLoss(ViolationMixin, WrappedLoss):
         tolerance = check_number("tolerance", tolerance)
         self.register_coeff_buffer("tolerance", tolerance, device=self.cost_critic_coeff.device)
 
-    def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:
-        return rectified_advantage(advantage, cost_advantage, self.cost_violation, self.tolerance)
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        rectified = rectified_advantage(
+            advantage, cost_advantage, self.cost_violation, self.tolerance
+        )
+        return self.unconstrained(tensordict, rectified)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,8 +17,9 @@ from torchrl.objectives.value import GAE, ValueEstimatorBase
 
 from torchrl_safe.objectives._actor import divergence
 from torchrl_safe.objectives._checks import check_discount
-from torchrl_safe.objectives._cost_critic import CostKeys, get_or_raise
-from torchrl_safe.objectives._lagrange import LagrangeMultiplierMixin
+from torchrl_safe.objectives._constrained import ConstrainedPPO
+from torchrl_safe.objectives._cost_critic import get_or_raise
+from torchrl_safe.objectives._reduction import reduced
 
 
 def projection_objective(
@@ -60,7 +60,7 @@ def projection_objective(
     return kl + scale * ratio * cost
 
 
-class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
+class CUPLoss(ConstrainedPPO, ClipPPOLoss):
     r"""Improves the policy with clipped PPO, then projects it towards the limits of k costs.
 
     Presented in "Constrained Update Projection Approach to Safe Policy Optimization", Yang et al.
@@ -149,12 +149,6 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
 
     improved_actor_params: TensorDictParams
 
-    @dataclass
-    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
@@ -169,7 +163,7 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         super().__init__(
             actor_network,
             critic_network,
-            cost_critic_network=cost_critic_network,
+            cost_critic_network,
             num_costs=num_costs,
             multiplier_init=multiplier_init,
             cost_critic_coeff=cost_critic_coeff,
@@ -183,6 +177,11 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         if self.functional:
             return self.actor_network_params
         return TensorDict.from_module(self.actor_network)
+
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        return self.unconstrained(tensordict, advantage)
 
     def start_projection(self) -> None:
         """Keeps the policy as it is now, for :meth:`projection_loss` to stay near it."""
@@ -205,21 +204,16 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         """
         tensordict = tensordict.clone(False)
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
-        log_weight, dist, _, log_is_weight = self._log_weight(
-            tensordict, adv_shape=cost_advantage.shape[:-1]
-        )
-        if log_is_weight is not None:
-            log_weight = log_weight + log_is_weight
-        kl = divergence(dist, self._improved_policy(tensordict)).unsqueeze(-1)
+        improved = self._improved_policy(tensordict)
+        policy = self.evaluate(tensordict)
+        kl = divergence(policy.distribution, improved).unsqueeze(-1)
         objective = projection_objective(
-            kl, log_weight.exp(), cost_advantage, self.lagrange_multiplier, self._cost_scale()
+            kl, policy.ratio(), cost_advantage, self.lagrange_multiplier, self._cost_scale()
         )
-        losses = TensorDict(
-            loss_projection=self._reduce_loss(objective, tensordict).squeeze(-1),
-            kl=self._reduce_loss(kl.detach(), tensordict, reduction="mean"),
+        return TensorDict(
+            loss_projection=reduced(self, objective, tensordict).squeeze(-1),
+            kl=reduced(self, kl.detach(), tensordict, reduction="mean"),
         )
-        self._clear_weakrefs(tensordict, losses, "actor_network_params", "improved_actor_params")
-        return losses
 
     @torch.no_grad()
     def _improved_policy(self, tensordict: TensorDictBase) -> torch.distributions.Distribution:

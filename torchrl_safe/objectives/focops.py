@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,12 +13,12 @@ from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives._actor import divergence
 from torchrl_safe.objectives._checks import as_number, check_number
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
+from torchrl_safe.objectives._constrained import ConstrainedPPO
+from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.functional import penalized_advantage
 
 
-class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
+class FOCOPSLoss(ConstrainedPPO, PPOLoss):
     r"""Projects the best policy of a trust region on the policies of the network.
 
     Presented in "First Order Constrained Optimization in Policy Space", Zhang, Vuong, Ross 2020
@@ -113,14 +112,10 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
 
     _schedulable_buffers = frozenset({"temperature", "kl_bound"})
 
+    policy_out_keys = ("loss_kl", "kl")
+
     temperature: Tensor
     kl_bound: Tensor
-
-    @dataclass
-    class _AcceptedKeys(CostKeys, PPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,
@@ -138,7 +133,7 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
         super().__init__(
             actor_network,
             critic_network,
-            cost_critic_network=cost_critic_network,
+            cost_critic_network,
             num_costs=num_costs,
             multiplier_init=multiplier_init,
             cost_critic_coeff=cost_critic_coeff,
@@ -150,38 +145,32 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
         device = self.cost_critic_coeff.device
         self.register_coeff_buffer("temperature", temperature, device=device)
         self.register_coeff_buffer("kl_bound", float(kl_bound), device=device)
-        self._kl: Any = None
 
-    def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:
-        multiplier = self.lagrange_multiplier
-        mixed = penalized_advantage(advantage, cost_advantage, multiplier, rescale=False)
-        return mixed / self.temperature
-
-    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
-        # Read before the policy is evaluated, which may write parameters of its own.
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        # Read before the policy is evaluated, which writes parameters of its own.
         old = self.actor_network.build_dist_from_params(
             tensordict.select(*self._distribution_keys())
         )
-        log_weight, dist, *others = super()._log_weight(tensordict, adv_shape)
-        kl = divergence(dist, old).unsqueeze(-1)
-        # Kept for the other term, so that the policy is evaluated once.
-        self._kl = kl
+        policy = self.evaluate(tensordict)
+        kl = divergence(policy.distribution, old).unsqueeze(-1)
+        far = kl > self.kl_bound
+        gain = penalized_advantage(
+            advantage, cost_advantage, self.lagrange_multiplier, rescale=False
+        )
         # A ratio of zero leaves a state out of the objective and of its gradient.
-        return log_weight.masked_fill(kl > self.kl_bound, -torch.inf), dist, *others
+        near = policy._replace(log_ratio=policy.log_ratio.masked_fill(far, -torch.inf))
+        losses = self.unconstrained(tensordict, gain / self.temperature, near)
+        near_kl = reduced(self, kl.masked_fill(far, 0.0), tensordict)
+        losses.set("loss_kl", near_kl.squeeze(-1))
+        losses.set("kl", reduced(self, kl.detach(), tensordict, reduction="mean"))
+        return losses
 
     def _distribution_keys(self) -> list[NestedKey]:
         return self.actor_network[-1].in_keys
 
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        self._in_keys += [key for key in self._distribution_keys() if key not in self._in_keys]
-
-    def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
-        kl, self._kl = self._kl, None
-        near = kl.masked_fill(kl > self.kl_bound, 0.0)
-        losses.set("loss_kl", self._reduce_loss(near, tensordict).squeeze(-1))
-        losses.set("kl", self._reduce_loss(kl.detach(), tensordict, reduction="mean"))
-        super()._set_cost_outputs(losses, tensordict)
-
-    def _cost_out_keys(self) -> list[NestedKey]:
-        return ["loss_kl", "kl", *super()._cost_out_keys()]
+    def _list_in_keys(self) -> None:
+        super()._list_in_keys()
+        keys = [*self.in_keys, *self._distribution_keys()]
+        self.in_keys = list(dict.fromkeys(keys))

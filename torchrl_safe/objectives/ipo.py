@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._surrogate import CostSurrogateMixin
+from torchrl_safe.objectives._surrogate import CostSurrogate
 
 
 def log_barrier(violation: Tensor, sharpness: Tensor) -> Tensor:
@@ -42,7 +41,7 @@ def log_barrier(violation: Tensor, sharpness: Tensor) -> Tensor:
     return -(-inside).log() / sharpness + sharpness * (violation - inside)
 
 
-class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
+class IPOLoss(CostSurrogate, ClipPPOLoss):
     r"""Clipped PPO loss with a logarithmic barrier before the limits of k expected costs.
 
     Presented in "IPO: Interior-point Policy Optimization under Constraints", Liu, Ding, Liu 2019
@@ -141,12 +140,6 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
 
     sharpness: Tensor
 
-    @dataclass
-    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
@@ -161,7 +154,7 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
         super().__init__(
             actor_network,
             critic_network,
-            cost_critic_network=cost_critic_network,
+            cost_critic_network,
             num_costs=num_costs,
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
@@ -169,6 +162,13 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
         sharpness = check_number("sharpness", sharpness, positive=True)
         self.register_coeff_buffer("sharpness", sharpness, device=self.cost_critic_coeff.device)
 
-    def _penalty(self, surrogate: Tensor) -> Tensor:
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        policy = self.evaluate(tensordict)
+        losses = self.unconstrained(tensordict, advantage, policy)
+        surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
         scale = 1 - self.cost_value_estimator.gamma
-        return scale * log_barrier(self.cost_violation + surrogate / scale, self.sharpness)
+        predicted = self.cost_violation + surrogate / scale
+        losses.set("loss_penalty", (scale * log_barrier(predicted, self.sharpness)).sum())
+        return losses

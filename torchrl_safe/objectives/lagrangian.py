@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._lagrange import LagrangeMultiplierMixin
+from torchrl_safe.objectives._constrained import ConstrainedLoss
 from torchrl_safe.objectives._wrapped import WrappedLoss
 from torchrl_safe.objectives.functional import penalized_advantage
 
 
-class LagrangianLoss(LagrangeMultiplierMixin, WrappedLoss):
+class LagrangianLoss(ConstrainedLoss, WrappedLoss):
     r"""Puts an advantage loss under constraints on k expected costs.
 
     The wrapped loss is left as it is; it is given the advantage of
@@ -105,12 +103,6 @@ class LagrangianLoss(LagrangeMultiplierMixin, WrappedLoss):
         ['loss_cost_critic', 'loss_critic', 'loss_objective']
     """
 
-    @dataclass
-    class _AcceptedKeys(CostKeys):
-        pass
-
-    default_keys = _AcceptedKeys
-
     def __init__(
         self,
         loss_module: LossModule,
@@ -130,5 +122,8 @@ class LagrangianLoss(LagrangeMultiplierMixin, WrappedLoss):
             separate_losses=separate_losses,
         )
 
-    def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:
-        return penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+        return self.unconstrained(tensordict, mixed)

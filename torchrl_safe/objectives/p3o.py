@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._surrogate import CostSurrogateMixin
+from torchrl_safe.objectives._surrogate import CostSurrogate
 
 
 def exact_penalty(
@@ -38,7 +37,7 @@ def exact_penalty(
     return coeff * (surrogate + scale * violation).relu()
 
 
-class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
+class P3OLoss(CostSurrogate, ClipPPOLoss):
     r"""Clipped PPO loss with an exact penalty on k expected costs.
 
     Presented in "Penalized Proximal Policy Optimization for Safe Reinforcement Learning", Zhang
@@ -128,12 +127,6 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
 
     penalty_coeff: Tensor
 
-    @dataclass
-    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
@@ -148,7 +141,7 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
         super().__init__(
             actor_network,
             critic_network,
-            cost_critic_network=cost_critic_network,
+            cost_critic_network,
             num_costs=num_costs,
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
@@ -157,6 +150,13 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
         device = self.cost_critic_coeff.device
         self.register_coeff_buffer("penalty_coeff", penalty_coeff, device=device)
 
-    def _penalty(self, surrogate: Tensor) -> Tensor:
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        policy = self.evaluate(tensordict)
+        losses = self.unconstrained(tensordict, advantage, policy)
+        surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
         scale = 1 - self.cost_value_estimator.gamma
-        return exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)
+        penalty = exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)
+        losses.set("loss_penalty", penalty.sum())
+        return losses

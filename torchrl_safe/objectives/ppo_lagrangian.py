@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
+from torchrl_safe.objectives._constrained import ConstrainedPPO
+from torchrl_safe.objectives.functional import penalized_advantage
 
 
-class PPOLagrangianLoss(MixedAdvantageMixin, ClipPPOLoss):
+class PPOLagrangianLoss(ConstrainedPPO, ClipPPOLoss):
     r"""Clipped PPO loss under constraints on k expected costs.
 
     Presented in "Benchmarking Safe Exploration in Deep Reinforcement Learning", Ray, Achiam,
@@ -93,29 +90,8 @@ class PPOLagrangianLoss(MixedAdvantageMixin, ClipPPOLoss):
         ['loss_cost_critic', 'loss_critic', 'loss_objective']
     """
 
-    @dataclass
-    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
-        cost_critic_network: TensorDictModuleBase,
-        *,
-        num_costs: int = 1,
-        multiplier_init: float | Tensor = 0.0,
-        cost_critic_coeff: float = 1.0,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            actor_network,
-            critic_network,
-            cost_critic_network=cost_critic_network,
-            num_costs=num_costs,
-            multiplier_init=multiplier_init,
-            cost_critic_coeff=cost_critic_coeff,
-            **kwargs,
-        )
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+        return self.unconstrained(tensordict, mixed)

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._cost_critic import CostKeys, get_or_raise
-from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
-from torchrl_safe.objectives.violation import ViolationMixin
+from torchrl_safe.objectives._constrained import ConstrainedPPO
+from torchrl_safe.objectives._cost_critic import get_or_raise
+from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.functional import penalized_advantage
 
 
-class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
+class TrustRegionLoss(ConstrainedPPO, PPOLoss):
     r"""Unclipped surrogates of the reward and of k costs, for TRPO-Lagrangian, CPO and PCPO.
 
     With the ratio :math:`w = \pi_\theta(a|s) / \pi_{\theta_k}(a|s)`, ``"loss_objective"`` is
@@ -114,32 +111,13 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
         >>> optimizer.step()
     """
 
-    @dataclass
-    class _AcceptedKeys(CostKeys, PPOLoss._AcceptedKeys):
-        pass
+    cost_buffers = ("lagrange_multiplier", "cost_violation")
 
-    default_keys = _AcceptedKeys
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
-        cost_critic_network: TensorDictModuleBase,
-        *,
-        num_costs: int = 1,
-        multiplier_init: float | Tensor = 0.0,
-        cost_critic_coeff: float = 1.0,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            actor_network,
-            critic_network,
-            cost_critic_network=cost_critic_network,
-            num_costs=num_costs,
-            multiplier_init=multiplier_init,
-            cost_critic_coeff=cost_critic_coeff,
-            **kwargs,
-        )
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+        return self.unconstrained(tensordict, mixed)
 
     # Not among the outputs of forward: trainers add up everything there that is named a loss.
     def cost_surrogate_loss(self, tensordict: TensorDictBase) -> Tensor:
@@ -158,10 +136,6 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
         """
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
         self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
-        log_weight, _, _, correction = self._log_weight(
-            tensordict.clone(False), adv_shape=cost_advantage.shape[:-1]
-        )
-        if correction is not None:
-            log_weight = log_weight + correction
-        surrogates = (log_weight.exp() * cost_advantage).split(1, -1)
-        return torch.stack([self._reduce_loss(surrogate, tensordict) for surrogate in surrogates])
+        ratio = self.evaluate(tensordict.clone(False)).ratio()
+        surrogates = (ratio * cost_advantage).split(1, -1)
+        return torch.stack([reduced(self, surrogate, tensordict) for surrogate in surrogates])

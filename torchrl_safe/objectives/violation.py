@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_safe.objectives._cost_critic import CostCriticMixin, report_each
 from torchrl_safe.objectives._cost_updater import CostUpdater
 
 
@@ -50,24 +44,3 @@ class ViolationUpdater(CostUpdater):
 
     def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
         buffer.copy_(self._violation(episode_cost))
-
-
-class ViolationMixin(CostCriticMixin):
-    """Adds the buffer that :class:`ViolationUpdater` writes, and reports it."""
-
-    cost_violation: Tensor
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        violation = torch.zeros(self.num_costs, device=self.cost_critic_coeff.device)
-        self.register_buffer("cost_violation", violation)
-
-    def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
-        super()._set_cost_outputs(losses, tensordict)
-        report_each(losses, "cost_violation", self.cost_violation)
-
-    def _cost_out_keys(self) -> list[NestedKey]:
-        return [
-            *super()._cost_out_keys(),
-            *(f"cost_violation_{index}" for index in range(self.num_costs)),
-        ]

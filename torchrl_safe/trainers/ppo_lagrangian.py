@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 from torchrl.trainers.algorithms import PPOTrainer
 
 from torchrl_safe.objectives import CUPLoss, TrustRegionLoss
-from torchrl_safe.objectives._cost_critic import CostCriticMixin
+from torchrl_safe.objectives._cost_critic import CostCritic
 from torchrl_safe.objectives._cost_updater import CostUpdater
 from torchrl_safe.trainers.multiplier_hook import MultiplierHook
 
@@ -142,7 +142,7 @@ class PPOLagrangianTrainer(PPOTrainer):
 
 
 def _check_loss(loss_module: LossModule) -> None:
-    if not isinstance(loss_module, CostCriticMixin):
+    if not isinstance(loss_module, CostCritic):
         raise TypeError(
             "loss_module must be an on-policy loss with a cost critic, such as PPOLagrangianLoss, "
             f"got {type(loss_module).__name__}."
