@@ -183,11 +183,11 @@ class CostCritic(LossModule):
             target_params=self.target_cost_critic_network_params,
         )
         cost_advantage = data.get(keys.cost_advantage)
-        mask = counted(self, data, cost_advantage)
+        mask = counted(self, data, data.get(keys.advantage))
         advantage, cost_advantage = scaled_advantages(
             data.get(keys.advantage),
             cost_advantage,
-            counted=None if mask is None else mask[..., :1],
+            counted=mask,
             standardize=self.advantage_norm is None,
             # CostGAE has done so already, over every step: that is over too many under a mask.
             centre=mask is not None and isinstance(estimator, CostGAE) and estimator.average_gae,

@@ -12,10 +12,9 @@ def counted(loss: LossModule, tensordict: TensorDictBase, values: Tensor) -> Ten
     """The steps that a loss counts, expanded to the shape of the values, or None if all."""
     key = loss.loss_mask_key
     keys = AUTO_LOSS_MASK_KEYS if key == "auto" else () if key is None else (key,)
-    masks = [mask for key in keys if (mask := tensordict.get(key, None)) is not None]
-    if not masks:
-        return None
-    return torch.stack([_expanded(mask, values) for mask in masks]).all(0)
+    found = [tensordict.get(key, None) for key in keys]
+    masks = [_expanded(mask, values) for mask in found if mask is not None]
+    return torch.stack(masks).all(0) if masks else None
 
 
 def reduced(

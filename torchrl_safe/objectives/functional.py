@@ -82,6 +82,7 @@ def centred(values: Tensor, counted: Tensor | None = None) -> Tensor:
     rows = tuple(range(values.ndim - 1))
     if counted is None:
         return values - values.mean(rows, keepdim=True)
+    counted = counted.expand_as(values).contiguous()
     count = counted.sum(rows, keepdim=True).clamp_min(1)
     return values - torch.where(counted, values, 0.0).sum(rows, keepdim=True) / count
 
