@@ -37,7 +37,7 @@ from torchrl_safe.envs.moving import Motion, Moving, Patrol, Swing
 from torchrl_safe.envs.observations import FullObservation, paper_observation
 from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placement, Scattered
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS, paper_env
-from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.saute import Saute
 from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
@@ -81,6 +81,7 @@ __all__ = [
     "Motion",
     "Moving",
     "NoObstacles",
+    "NoRoomError",
     "Obstacles",
     "Patrol",
     "PickAndPlace",

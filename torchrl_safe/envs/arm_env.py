@@ -210,7 +210,7 @@ class ArmEnv(EnvBase):
     def _make_specs(self) -> None:
         for row in range(self.num_envs):
             self._reset_world(row, np.random.default_rng(0))
-        self._state = state = self._batch.state()
+        self._state = state = self._batch.state(self._elapsed)
         # What the arguments compute is checked here once, so that it fails at the door.
         joints = state.joint_position.shape[1]
         width = self.action_mode.width(joints)
@@ -268,7 +268,7 @@ class ArmEnv(EnvBase):
         for row in rows:
             self._reset_world(int(row), self._generators[int(row)])
         self._begun = True
-        self._state = self._batch.state()
+        self._state = self._batch.state(self._elapsed)
         return self._pack(
             observation=self._observe(self._state),
             success=np.zeros((self.num_envs, 1), dtype=bool),
@@ -285,7 +285,7 @@ class ArmEnv(EnvBase):
         self._record.add(self._elapsed, joints, fingers)
         self._batch.advance(joints, fingers)
         self._elapsed += 1
-        self._state = state = self._batch.state()
+        self._state = state = self._batch.state(self._elapsed)
         reward, cost, success = self._outcome(state)
         truncated = (self._elapsed >= self.max_episode_steps)[:, None] & ~success
         return self._pack(
@@ -350,7 +350,7 @@ class ArmEnv(EnvBase):
         self._elapsed = state["elapsed"].numpy().copy()
         self._record.targets = state["targets"].numpy().copy()
         self._generators = [unpack(packed) for packed in state["generators"]]
-        self._state = self._batch.state()
+        self._state = self._batch.state(self._elapsed)
         if not np.array_equal(saved, after := self._batch.table()):
             warnings.warn(
                 "The running episodes did not come back bit for bit, but with differences of up to "

@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from itertools import accumulate
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.bullet import TOOL_MOTION, World
 from torchrl_safe.envs.obstacles import Placement
-from torchrl_safe.envs.scene import Camera, Scene
+from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.sensors import Vector, velocity_at
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
@@ -95,8 +96,12 @@ class WorldBatch:
         """Returns what each world was when it was last read, one row each."""
         return np.array(self._rows)
 
-    def state(self) -> ArmState:
-        """Returns the state of all worlds."""
+    def state(self, step: NDArray[np.int_]) -> ArmState:
+        """Returns the state of all worlds.
+
+        Args:
+            step: control steps of each episode, ``(N,)``: of them only the environment knows.
+        """
         row = split(self.table(), self._parts)
         tool = [row["ee_position"], *(row.pop(name) for name in TOOL_MOTION)]
         velocity = velocity_at(*([*part.T] for part in tool))
@@ -110,6 +115,8 @@ class WorldBatch:
             obstacle_size=self._sizes,
             contact_distance=self._contact_distance.copy(),
             contact_force=self._contact_force.copy(),
+            step=step.copy(),
+            time=step * self._frame_skip * SUBSTEP,
             trace=Trace(
                 split(np.array(self._measured), self._trace_parts) if self._trace_parts else {}
             ),
