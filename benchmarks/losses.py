@@ -43,7 +43,11 @@ def make_losses() -> dict[str, LossModule]:
     for name in ("PPOLagrangian", "FOCOPS", "CUP", "P3O", "IPO", "TrustRegion"):
         networks = make_actor(), make_critic("state_value"), make_critic("cost_value")
         losses[name] = getattr(ours, f"{name}Loss")(*networks)
-    for name, parent in (("Lagrangian", ClipPPOLoss), ("Lagrangian", A2CLoss), ("CRPO", ClipPPOLoss)):
+    for name, parent in (
+        ("Lagrangian", ClipPPOLoss),
+        ("Lagrangian", A2CLoss),
+        ("CRPO", ClipPPOLoss),
+    ):
         wrapped = parent(make_actor(), make_critic("state_value"))
         title = f"{name}({parent.__name__})"
         losses[title] = getattr(ours, f"{name}Loss")(wrapped, make_critic("cost_value"))

@@ -3,6 +3,9 @@ cost critics' targets, the mixed objective, keys, states and how they plug in.""
 
 import copy
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -606,6 +609,27 @@ def test_call_with_keywords_equals_call_with_tensordict(kind):
     critic, multiplier = loss(**by_keyword(loss, batch))
     assert torch.equal(critic, expected["loss_cost_qvalue"])
     assert multiplier == 0.7
+
+
+@each_loss
+def test_outputs_can_be_selected_before_torchrl_has_built_the_parent(kind):
+    """TorchRL makes a property of a class's list of outputs when that class itself is built."""
+    code = (
+        "from off_policy import *\n"
+        f"loss = make_loss({kind.__name__}, 2)\n"
+        "print(*loss.select_out_keys('loss_actor', 'loss_cost_qvalue').out_keys)\n"
+        "print(*sorted(loss(make_batch(2)).keys()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["loss_actor loss_cost_qvalue"] * 2
 
 
 @each_loss

@@ -9,9 +9,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives._checks import check_discount
 from torchrl_safe.objectives._constrained import ConstrainedPPO, Policy
 from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.violation import check_episode_length, check_length_known
 
 
 def clipped_cost_surrogate(
@@ -50,8 +50,9 @@ class CostSurrogate(ConstrainedPPO):
     cost_buffers = ("cost_violation",)
     policy_out_keys = ("loss_penalty",)
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, episode_length: float | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.episode_length = check_episode_length(episode_length)
         if self.reduction != "mean":
             raise ValueError(
                 "reduction must be 'mean', since the penalty is a function of the batch mean, got "
@@ -74,4 +75,4 @@ class CostSurrogate(ConstrainedPPO):
         return torch.stack([reduced(self, column, tensordict) for column in surrogate.unbind(-1)])
 
     def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
-        check_discount(estimator.gamma)
+        check_length_known(self.episode_length, estimator.gamma)

@@ -12,6 +12,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives._checks import check_number
 from torchrl_safe.objectives._surrogate import CostSurrogate
+from torchrl_safe.objectives.violation import per_step
 
 
 def log_barrier(violation: Tensor, sharpness: Tensor) -> Tensor:
@@ -83,14 +84,17 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         num_costs (int, optional): number k of costs. Defaults to ``1``.
         sharpness (float, optional): the paper's t: the larger, the closer to the limit the
             barrier acts. Defaults to ``20.0``.
+        episode_length (float, optional): mean number of steps of an episode, to compare a
+            surrogate, which is about one step, with a violation, which is about an episode.
+            Defaults to :math:`1 / (1 - \gamma)`, as in the equation above.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
         ValueError: if ``num_costs`` or ``sharpness`` is not positive, ``reduction`` is not
-            ``"mean"`` or the discount of the costs is 1; in a call, if the cost critic or the
-            costs have another width than ``num_costs``.
+            ``"mean"`` or the discount of the costs is 1 without an ``episode_length``; in a
+            call, if the cost critic or the costs have another width than ``num_costs``.
 
     Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
     ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
@@ -148,6 +152,7 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         *,
         num_costs: int = 1,
         sharpness: float = 20.0,
+        episode_length: float | None = None,
         cost_critic_coeff: float = 1.0,
         **kwargs: Any,
     ) -> None:
@@ -156,6 +161,7 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
             critic_network,
             cost_critic_network,
             num_costs=num_costs,
+            episode_length=episode_length,
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
@@ -168,7 +174,7 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         policy = self.evaluate(tensordict)
         losses = self.unconstrained(tensordict, advantage, policy)
         surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
-        scale = 1 - self.cost_value_estimator.gamma
+        scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
         predicted = self.cost_violation + surrogate / scale
         losses.set("loss_penalty", (scale * log_barrier(predicted, self.sharpness)).sum())
         return losses

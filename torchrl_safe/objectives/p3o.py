@@ -11,6 +11,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives._checks import check_number
 from torchrl_safe.objectives._surrogate import CostSurrogate
+from torchrl_safe.objectives.violation import per_step
 
 
 def exact_penalty(
@@ -70,14 +71,17 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
         num_costs (int, optional): number k of costs. Defaults to ``1``.
         penalty_coeff (float, optional): the factor :math:`\kappa`, in units of standardized
             reward advantage per cost advantage. Defaults to ``20.0``.
+        episode_length (float, optional): mean number of steps of an episode, to compare a
+            surrogate, which is about one step, with a violation, which is about an episode.
+            Defaults to :math:`1 / (1 - \gamma)`, as in the equation above.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
         ValueError: if ``num_costs`` or ``penalty_coeff`` is not positive, ``reduction`` is not
-            ``"mean"`` or the discount of the costs is 1; in a call, if the cost critic or the
-            costs have another width than ``num_costs``.
+            ``"mean"`` or the discount of the costs is 1 without an ``episode_length``; in a
+            call, if the cost critic or the costs have another width than ``num_costs``.
 
     Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
     ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
@@ -135,6 +139,7 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
         *,
         num_costs: int = 1,
         penalty_coeff: float = 20.0,
+        episode_length: float | None = None,
         cost_critic_coeff: float = 1.0,
         **kwargs: Any,
     ) -> None:
@@ -143,6 +148,7 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
             critic_network,
             cost_critic_network,
             num_costs=num_costs,
+            episode_length=episode_length,
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
@@ -156,7 +162,7 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
         policy = self.evaluate(tensordict)
         losses = self.unconstrained(tensordict, advantage, policy)
         surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
-        scale = 1 - self.cost_value_estimator.gamma
+        scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
         penalty = exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)
         losses.set("loss_penalty", penalty.sum())
         return losses

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import PPOLoss
 
@@ -26,7 +26,7 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
     https://arxiv.org/abs/1705.10528, equation 10), and :meth:`cost_surrogate_loss` gives
     :math:`\mathrm{E}[w A_{c_i}]`. Nothing here bounds the policy's step: a
     :class:`~torchrl_safe.objectives.TrustRegionStep` moves the actor, an ordinary optimizer the
-    two critics on ``"loss_critic"`` and ``"loss_cost_critic"``. (TRPO without costs needs no
+    two critics on :meth:`critic_losses`. (TRPO without costs needs no
     more than :class:`~torchrl.objectives.PPOLoss`.)
 
     This class is a thin specialization of :class:`~torchrl.objectives.PPOLoss`, whose arguments,
@@ -106,7 +106,7 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
         >>> info = actor_step.step(data)
         >>> bool(info["kl"] <= 0.01)
         True
-        >>> losses = loss(data)
+        >>> losses = loss.critic_losses(data)
         >>> (losses["loss_critic"] + losses["loss_cost_critic"]).backward()
         >>> optimizer.step()
     """
@@ -139,3 +139,25 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
         ratio = self.evaluate(tensordict.clone(False)).ratio()
         surrogates = (ratio * cost_advantage).split(1, -1)
         return torch.stack([reduced(self, surrogate, tensordict) for surrogate in surrogates])
+
+    def critic_losses(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The losses of both critics, without the policy, which the step has already moved.
+
+        Args:
+            tensordict (TensorDictBase): data with the critics' inputs and value targets.
+
+        Returns:
+            ``"loss_critic"`` and ``"loss_cost_critic"``, those of a call of the loss, bit for
+            bit.
+
+        Raises:
+            KeyError: if a value target is missing.
+        """
+        tensordict = tensordict.clone(False)
+        tensordict.update(self.actor_features(tensordict))
+        losses = {"loss_cost_critic": self.loss_cost_critic(tensordict)[0]}
+        if self.critic_coeff is not None:
+            losses["loss_critic"] = self.loss_critic(tensordict)[0]
+        return TensorDict(
+            {name: reduced(self, loss, tensordict).squeeze(-1) for name, loss in losses.items()}
+        )
