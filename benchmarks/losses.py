@@ -63,7 +63,6 @@ def serve(config: Config) -> None:
         batches[size] = make_minibatch(size)
         dist = torch.randn(size, 7), torch.ones(size, 7)
         batches[size]["loc"], batches[size]["scale"] = dist
-    print(*losses, flush=True)
     for line in sys.stdin:
         name, size = line.split()
         loss, batch = losses[name], batches[int(size)]
@@ -107,7 +106,7 @@ def main(config: Config) -> None:
         return
     here = Path(__file__).resolve().parents[1]
     workers = [start_worker(root, config) for root in (here, config.against)]
-    names = [worker.stdout.readline().split() for worker in workers][0]  # type: ignore[union-attr]
+    names = list(make_losses())
     for size in config.sizes:
         least = {name: [float("inf")] * 2 for name in names}
         for _ in range(config.turns):
