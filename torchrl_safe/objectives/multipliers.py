@@ -50,12 +50,16 @@ class MultiplierUpdater(CostUpdater):
         >>> import torch
         >>> class Exponentiated(MultiplierUpdater):
         ...     def next_multiplier(self, multiplier, violation):
-        ...         return multiplier * violation.exp()
+        ...         # By a factor of 1.2 at most. The lower bound lets it start from 0.
+        ...         step = 0.2 * (violation / self.cost_limit).clamp(-1, 1)
+        ...         return multiplier.clamp_min(0.01) * step.exp()
         >>> loss = LossModule()
-        >>> loss.register_buffer("lagrange_multiplier", torch.ones(1))
-        >>> Exponentiated(loss, cost_limit=2.0, max_multiplier=2.5).step(torch.tensor([[3.0]]))
+        >>> loss.register_buffer("lagrange_multiplier", torch.zeros(1))
+        >>> updater = Exponentiated(loss, cost_limit=2.0, max_multiplier=10.0)
+        >>> for _ in range(5):
+        ...     updater.step(torch.tensor([[30.0]]))
         >>> loss.lagrange_multiplier
-        tensor([2.5000])
+        tensor([0.0272])
     """
 
     buffer_name = "lagrange_multiplier"
