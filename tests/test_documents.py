@@ -106,7 +106,7 @@ def test_readme_recipes(tmp_path):
 def test_environments(tmp_path):
     """Each block runs by itself, and each environment in it is one."""
     blocks = code_of("docs/environments.md")
-    assert len(blocks) == 6
+    assert len(blocks) == 7
     script = tmp_path / "environments.py"
     check = "env.reset()\nenv.close()\n"
     script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")

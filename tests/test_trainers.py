@@ -207,6 +207,22 @@ def test_bad_names(settings, message):
         MultiplierHook(updater, **settings)
 
 
+def test_names_are_those_of_the_updater():
+    loss, limits = make_loss(num_costs=2), {"touch": 1.0, "speed": 2.0}
+    updater = DualAscent(loss, cost_limit=limits, cost_names=["touch", "speed"], lr=0.5)
+    for hook in (MultiplierHook(updater), MultiplierHook(updater, cost_names=["touch", "speed"])):
+        batch = make_episodes([[3.0, 2.0]], [True])
+        assert set(hook.log(batch)) == {
+            "log_pbar",
+            "episode_cost/touch",
+            "episode_cost/speed",
+            "lagrange_multiplier/touch",
+            "lagrange_multiplier/speed",
+        }
+    with pytest.raises(ValueError, match=r"those of the updater, \('touch', 'speed'\), or be left"):
+        MultiplierHook(updater, cost_names=["speed", "touch"])
+
+
 def test_no_updater():
     with pytest.raises(TypeError, match=r"updater must be a MultiplierUpdater .* got SGD"):
         MultiplierHook(torch.optim.SGD([nn.Parameter(torch.ones(1))]))

@@ -28,6 +28,18 @@ def test_it_writes_mean_cost_minus_limit_in_place(limit):
     assert loss.cost_violation.tolist() == [0.0, 0.0]
 
 
+def test_limits_go_by_name():
+    loss = P3OLoss(*make_networks(2), num_costs=2)
+    limits = {"speed": 4.0, "touch": 1.5}
+    updater = ViolationUpdater(loss, cost_limit=limits, cost_names=("touch", "speed"))
+    updater.step(torch.tensor([[2.0, 3.0]]))
+    assert loss.cost_violation.tolist() == [0.5, -1.0]
+    with pytest.raises(ValueError, match=r"missing \['speed'\], unknown \['velocity'\]"):
+        ViolationUpdater(
+            loss, cost_limit={"touch": 1, "velocity": 2}, cost_names=updater.cost_names
+        )
+
+
 def test_pessimism_adds_standard_errors():
     loss, _ = make()
     updater = ViolationUpdater(loss, cost_limit=1.0, pessimism=2.0)
