@@ -4,12 +4,12 @@ import re
 
 import pytest
 import torch
-from networks import make_batch, make_critic
 from tensordict import TensorDict
 from torchrl.data import MultiStep
 from torchrl.objectives.value import MultiAgentGAE
 
 from torchrl_safe.objectives import CostGAE
+from torchrl_safe.testing import make_batch, make_critic
 
 GAMMA, LMBDA = 0.9, 0.7
 

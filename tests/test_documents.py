@@ -170,6 +170,22 @@ def test_trainers(tmp_path):
     assert (tmp_path / "runs" / "checkpoint").exists()
 
 
+def test_testing(tmp_path):
+    """A loss that a user wrote passes all checks but the one that it is said to fail."""
+    own, failing, every, rule = code_of("docs/testing.md")
+    assert len(own.splitlines()) < 30
+    script = tmp_path / "own.py"
+    caught = (
+        f"try:\n    {failing.splitlines()[0]}\nexcept AssertionError as error:\n    print(error)\n"
+    )
+    # The doctest of check_loss runs the call.
+    *imports, _ = every.splitlines()
+    script.write_text("\n".join([own, caught, *imports, rule]), encoding="utf-8")
+    shown = run(script)
+    expected = failing.splitlines()[1].removeprefix("# AssertionError: ").removesuffix(" ...")
+    assert shown.startswith(expected)
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda p: p.stem)
 def test_tutorial(path):
     assert run(path)

@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from networks import make_loss
+from on_policy import make_loss
 from torch.distributions.transforms import SoftplusTransform
 from torchrl.objectives import LossModule
 

@@ -4,10 +4,11 @@ import re
 
 import pytest
 import torch
-from networks import make_batch, make_loss, make_networks
+from on_policy import make_loss
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives import DualAscent, IPOLoss, P3OLoss, PIDControl, ViolationUpdater
+from torchrl_safe.testing import make_batch, make_networks
 
 
 def make(num_costs=2, cost_limit=1.0, kind=P3OLoss):
