@@ -5,7 +5,6 @@ from functools import partial
 
 import pytest
 import torch
-from networks import OBSERVATION, make_batch, make_networks
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.modules import (
@@ -35,6 +34,7 @@ from torchrl_safe.objectives import (
     TrustRegionLoss,
 )
 from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_networks
 
 
 def wrapping(make, parent):
@@ -86,7 +86,7 @@ class Trunk(nn.Linear):
 def make_heads(num_costs=2, hidden="hidden"):
     """A trunk, and actor, critic and cost critic on it as TorchRL's documentation has them."""
     torch.manual_seed(0)
-    trunk = Trunk(OBSERVATION, 8)
+    trunk = Trunk(OBSERVATION_SIZE, 8)
     policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
     value_head = ValueOperator(nn.Linear(8, 1), in_keys=[hidden])
     model = ActorValueOperator(

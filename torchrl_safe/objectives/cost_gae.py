@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives._checks import check_share
+from torchrl_safe.objectives._reduction import expanded_mask
 from torchrl_safe.objectives.functional import centred
 
 
@@ -113,7 +114,7 @@ class CostGAE(GAE):
 
     @vectorized.setter
     def vectorized(self, value: bool | None) -> None:
-        self._vectorized = value
+        GAE.vectorized.fset(self, value)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
@@ -169,4 +170,4 @@ class CostGAE(GAE):
     def _normalize_advantage(
         self, adv: Tensor, valid: Tensor | None = None, groups: Tensor | None = None
     ) -> Tensor:
-        return centred(adv, None if valid is None else self._expand_to_match(valid, adv))
+        return centred(adv, None if valid is None else expanded_mask(valid, adv))
