@@ -124,13 +124,15 @@ class FOCOPSLoss(ConstrainedPPO, PPOLoss):
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
-        # Read before the policy is evaluated, which writes parameters of its own.
+        # pi_theta_k, read before the policy is evaluated, which writes parameters of its own.
         old = self.actor_network.build_dist_from_params(
             tensordict.select(*self._distribution_keys())
         )
         policy = self.evaluate(tensordict)
+        # D_KL(pi_theta || pi_theta_k)
         kl = divergence(policy.distribution, old).unsqueeze(-1)
         far = kl > self.kl_bound
+        # A_r - sum_i nu_i A_ci
         gain = penalized_advantage(
             advantage, cost_advantage, self.lagrange_multiplier, rescale=False
         )

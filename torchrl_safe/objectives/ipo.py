@@ -147,9 +147,15 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
         policy = self.evaluate(tensordict)
+        # PPO's own losses, for the reward.
         losses = self.unconstrained(tensordict, advantage, policy)
+        # E[max(r A_c, clip(r) A_c) - A_c]
         surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
+        # 1 - gamma
         scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
-        predicted = self.cost_violation + surrogate / scale
-        losses.set("loss_penalty", (scale * log_barrier(predicted, self.sharpness)).sum())
+        # J_c(pi_theta) - d
+        violation = self.cost_violation + surrogate / scale
+        # -(1 - gamma) / t log(d - J_c(pi_theta))
+        penalty = scale * log_barrier(violation, self.sharpness)
+        losses.set("loss_penalty", penalty.sum())
         return losses

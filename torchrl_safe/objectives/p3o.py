@@ -135,9 +135,13 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
         policy = self.evaluate(tensordict)
+        # PPO's own losses, for the reward.
         losses = self.unconstrained(tensordict, advantage, policy)
+        # E[max(r A_c, clip(r) A_c) - A_c]
         surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
+        # 1 - gamma
         scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
+        # kappa max(0, surrogate + (1 - gamma) (J_c - d))
         penalty = exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)
         losses.set("loss_penalty", penalty.sum())
         return losses
