@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from networks import make_actor, make_batch, make_critic, make_loss, make_networks
+from on_policy import make_loss
 from tensordict.utils import unravel_key
 from torch.distributions import kl_divergence
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, PPOLoss, SoftUpdate
@@ -28,6 +28,7 @@ from torchrl_safe.objectives.crpo import rectified_advantage
 from torchrl_safe.objectives.cup import projection_objective
 from torchrl_safe.objectives.ipo import log_barrier
 from torchrl_safe.objectives.p3o import exact_penalty
+from torchrl_safe.testing import make_actor, make_batch, make_critic, make_networks
 
 
 def crpo(actor, critic, cost_critic, *, num_costs=1, tolerance=0.0, **kwargs):
@@ -48,7 +49,7 @@ def build(make, num_costs=1, seed=0, **kwargs):
 
 
 def estimated(loss, num_costs=1, seed=1):
-    return loss.estimate_advantages(make_batch(num_costs, seed)).reshape(-1)
+    return loss.estimate_advantages(make_batch(num_costs, seed=seed)).reshape(-1)
 
 
 def step(loss, violation):
@@ -497,7 +498,7 @@ NESTED = {
 
 @every_loss
 def test_all_keys_can_be_nested(make):
-    networks = make_networks(2, value=NESTED["value"], cost_value=NESTED["cost_value"])
+    networks = make_networks(2, keys=NESTED)
     loss, expected = make(*networks, num_costs=2), build(make, 2)
     loss.set_keys(**NESTED)
     assert ("next", "info", "cost") in loss.in_keys

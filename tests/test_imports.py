@@ -72,8 +72,19 @@ def test_the_transforms_need_no_simulator():
     assert 'ImportError: Robot arms need PyBullet: pip install "torchrl-safe[arms]"' in done.stderr
 
 
-def test_the_metrics_need_neither_simulator_nor_environments_nor_losses():
-    assert load("torchrl_safe.metrics") == {"torchrl_safe.metrics"}
+@pytest.mark.parametrize(
+    ("module", "needed"),
+    [
+        ("policy", {"_files", "_program"}),
+        ("evaluation", {"_checks", "metrics"}),
+        ("metrics", set()),
+        ("checkpoint", set()),
+        ("collectors", set()),
+    ],
+)
+def test_these_need_neither_simulator_nor_environments_nor_losses(module, needed):
+    names = {f"torchrl_safe.{name}" for name in (module, *needed)}
+    assert load(f"torchrl_safe.{module}") == names
 
 
 def test_the_metrics_say_what_they_need():

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from networks import make_batch, make_critic, make_networks
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives import DualAscent, PIDControl, TrustRegionLoss, ViolationUpdater
+from torchrl_safe.testing import make_batch, make_critic, make_networks
 
 OPTIONS = {
     "default": {},

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from networks import ACTION, OBSERVATION, make_actor, make_batch, make_critic, make_networks, mlp
 from tensordict import TensorDict
 from tensordict.nn import (
     CompositeDistribution,
@@ -37,6 +36,15 @@ from torchrl_safe.objectives import (
     TrustRegionStep,
     ViolationUpdater,
 )
+from torchrl_safe.testing import (
+    ACTION_SIZE,
+    OBSERVATION_SIZE,
+    make_actor,
+    make_batch,
+    make_critic,
+    make_networks,
+)
+from torchrl_safe.testing.networks import mlp
 
 MAX_KL = 0.01
 BATCH = 128
@@ -49,7 +57,7 @@ METHODS = {
 
 
 def normal_actor(distribution):
-    policy = nn.Sequential(mlp(OBSERVATION, 2 * ACTION), NormalParamExtractor())
+    policy = nn.Sequential(mlp(OBSERVATION_SIZE, 2 * ACTION_SIZE), NormalParamExtractor())
     return ProbabilisticActor(
         TensorDictModule(policy, ["observation"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -60,7 +68,7 @@ def normal_actor(distribution):
 
 def discrete_actor(distribution):
     return ProbabilisticActor(
-        TensorDictModule(mlp(OBSERVATION, 3), ["observation"], ["logits"]),
+        TensorDictModule(mlp(OBSERVATION_SIZE, 3), ["observation"], ["logits"]),
         in_keys=["logits"],
         distribution_class=distribution,
         return_log_prob=True,
@@ -89,7 +97,8 @@ def act(loss, data):
 def make_data(loss, seed=1):
     """A batch by the present actor; what pays, costs too."""
     torch.manual_seed(seed)
-    data = act(loss, TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH]))
+    observation = torch.randn(BATCH, OBSERVATION_SIZE)
+    data = act(loss, TensorDict(observation=observation, batch_size=[BATCH]))
     action = data["action"].float().reshape(BATCH, -1)
     slope = torch.randn(action.shape[-1], 1)
     advantage = action @ slope + 0.3 * torch.randn(BATCH, 1)
@@ -152,7 +161,7 @@ def test_the_step_is_the_natural_gradient():
     """A linear mean, fixed unit deviations: H is the mean of x x^T for each action dimension."""
     actor = ProbabilisticActor(
         TensorDictModule(
-            nn.Sequential(nn.Linear(OBSERVATION, 1, bias=False), ConstantDeviation()),
+            nn.Sequential(nn.Linear(OBSERVATION_SIZE, 1, bias=False), ConstantDeviation()),
             ["observation"],
             ["loc", "scale"],
         ),
@@ -162,7 +171,7 @@ def test_the_step_is_the_natural_gradient():
     )
     torch.manual_seed(0)
     loss = PPOLoss(actor.double(), make_critic().double(), entropy_bonus=False)
-    data = TensorDict(observation=torch.randn(BATCH, OBSERVATION).double(), batch_size=[BATCH])
+    data = TensorDict(observation=torch.randn(BATCH, OBSERVATION_SIZE).double(), batch_size=[BATCH])
     data = act(loss, data)
     data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1).double()
     before = actor_state(loss)
@@ -288,7 +297,7 @@ def test_recovery_lowers_the_cost_whatever_the_reward():
 
 def test_a_composite_action():
     with set_composite_lp_aggregate(False):
-        network = nn.Sequential(mlp(OBSERVATION, 4), SplitParameters())
+        network = nn.Sequential(mlp(OBSERVATION_SIZE, 4), SplitParameters())
         actor = ProbabilisticActor(
             TensorDictModule(
                 network,
@@ -303,7 +312,7 @@ def test_a_composite_action():
         )
         torch.manual_seed(0)
         loss = PPOLoss(actor, make_critic(), entropy_bonus=False)
-        data = TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH])
+        data = TensorDict(observation=torch.randn(BATCH, OBSERVATION_SIZE), batch_size=[BATCH])
         data = act(loss, data)
         data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1)
         old = distribution(loss, data)
@@ -471,10 +480,13 @@ class Tied(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.first, self.second = nn.Linear(OBSERVATION, OBSERVATION), nn.Linear(OBSERVATION, 3)
-        self.again = nn.Linear(OBSERVATION, OBSERVATION)
+        self.first, self.second = (
+            nn.Linear(OBSERVATION_SIZE, OBSERVATION_SIZE),
+            nn.Linear(OBSERVATION_SIZE, 3),
+        )
+        self.again = nn.Linear(OBSERVATION_SIZE, OBSERVATION_SIZE)
         self.again.weight = self.first.weight
-        self.norm = nn.BatchNorm1d(OBSERVATION)
+        self.norm = nn.BatchNorm1d(OBSERVATION_SIZE)
 
     def forward(self, observation):
         return self.second(self.again(self.norm(self.first(observation).tanh())).tanh())
@@ -507,12 +519,14 @@ def test_every_part_of_an_action_counts():
     """A distribution that is not summed over its parts: each has its own ratio and divergence."""
     loss = PPOLoss(normal_actor(Normal), make_critic(), entropy_bonus=False)
     torch.manual_seed(0)
-    data = act(loss, TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH]))
+    data = act(
+        loss, TensorDict(observation=torch.randn(BATCH, OBSERVATION_SIZE), batch_size=[BATCH])
+    )
     data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1)
     old, before = distribution(loss, data), loss(data)["loss_objective"]
     info = TrustRegionStep(loss, max_kl=MAX_KL).step(data)
     kl = kl_divergence(old, distribution(loss, data))
-    assert kl.shape == (BATCH, ACTION)
+    assert kl.shape == (BATCH, ACTION_SIZE)
     torch.testing.assert_close(info["kl"], kl.mean())
     gain = before - loss(data)["loss_objective"]
     torch.testing.assert_close(info["surrogate_gain"], gain, rtol=0, atol=1e-6)

@@ -27,6 +27,7 @@ from torchrl_safe.envs.costs import (
     Workspace,
 )
 from torchrl_safe.envs.early_termination import EarlyTermination
+from torchrl_safe.envs.frame_skip import FrameSkip
 from torchrl_safe.envs.human import Human
 from torchrl_safe.envs.kinematics import (
     BulletInverseKinematics,
@@ -71,6 +72,7 @@ __all__ = [
     "Cylinder",
     "DampedLeastSquares",
     "EarlyTermination",
+    "FrameSkip",
     "FullObservation",
     "Gripper",
     "Human",

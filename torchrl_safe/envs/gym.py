@@ -12,10 +12,8 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from tensordict import TensorDict
 
 from torchrl_safe.envs.actions import CartesianDelta, JointDelta
@@ -24,8 +22,17 @@ from torchrl_safe.envs.arms import IIWA, PANDA, UR5, UR10, XARM6, XARM7
 from torchrl_safe.envs.human import Human
 from torchrl_safe.envs.moving import Moving
 from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Scattered
-from torchrl_safe.envs.safe_gym import SafeGymEnv, SafeGymWrapper
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Box
+except ImportError as error:
+    raise ImportError(
+        'torchrl_safe.envs.gym needs Gymnasium: pip install "torchrl-safe[arms]".'
+    ) from error
+
+from torchrl_safe.envs.safe_gym import SafeGymEnv, SafeGymWrapper
 
 __all__ = [
     "ACTIONS",

@@ -13,7 +13,7 @@ def counted(loss: LossModule, tensordict: TensorDictBase, values: Tensor) -> Ten
     key = loss.loss_mask_key
     keys = AUTO_LOSS_MASK_KEYS if key == "auto" else () if key is None else (key,)
     found = [tensordict.get(key, None) for key in keys]
-    masks = [_expanded(mask, values) for mask in found if mask is not None]
+    masks = [expanded_mask(mask, values) for mask in found if mask is not None]
     return torch.stack(masks).all(0) if masks else None
 
 
@@ -42,7 +42,8 @@ def reduced(
     return values.mean() if mask is None else values.sum() / mask.sum().clamp_min(1)
 
 
-def _expanded(mask: Tensor, values: Tensor) -> Tensor:
+def expanded_mask(mask: Tensor, values: Tensor) -> Tensor:
+    """A mask of steps in the shape of the values, a last dimension of 1 more or less."""
     while mask.ndim > values.ndim and mask.shape[-1] == 1:
         mask = mask.squeeze(-1)
     if mask.ndim > values.ndim:

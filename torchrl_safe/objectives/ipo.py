@@ -105,39 +105,14 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
         >>> from torchrl_safe.objectives import ViolationUpdater
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
-        >>> loss = IPOLoss(actor, critic, cost_critic, num_costs=2)
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> loss = IPOLoss(*make_networks(num_costs=2), num_costs=2)
         >>> updater = ViolationUpdater(loss, cost_limit=torch.tensor([1.0, 5.0]))
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> batch = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     batch = actor(batch)
-        >>> batch["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 2),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
-        >>> losses = loss(loss.estimate_advantages(batch).reshape(-1))
-        >>> losses["cost_violation_1"], losses["loss_penalty"] > 0
-        (tensor(-4.5000), tensor(True))
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))  # a row for each episode
+        >>> losses = loss(loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1))
+        >>> losses["cost_violation_0"], losses["loss_penalty"] > 0
+        (tensor(2.), tensor(True))
     """
 
     _schedulable_buffers = frozenset({"sharpness"})

@@ -68,41 +68,15 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
         >>> from torchrl_safe.objectives import CPO, TrustRegionStep, ViolationUpdater
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=TanhNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 1), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
-        >>> loss = TrustRegionLoss(actor, critic, cost_critic, entropy_bonus=False)
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> loss = TrustRegionLoss(*make_networks(), entropy_bonus=False)
         >>> critics = [loss.critic_network_params, loss.cost_critic_network_params]
         >>> optimizer = torch.optim.Adam([p for params in critics for p in params.parameters()])
         >>> updater = ViolationUpdater(loss, cost_limit=1.0)
         >>> actor_step = TrustRegionStep(loss, CPO(), max_kl=0.01)
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> done[:, -1] = True
-        >>> data = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     data = actor(data)
-        >>> data["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 1),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> updater.step(torch.tensor([[2.0], [3.0], [1.0]]))  # one cost for each episode
-        >>> data = loss.estimate_advantages(data).reshape(-1)
+        >>> updater.step(torch.tensor([[2.0], [3.0], [1.0]]))  # a row for each episode
+        >>> data = loss.estimate_advantages(make_batch()).reshape(-1)
         >>> info = actor_step.step(data)
         >>> bool(info["kl"] <= 0.01)
         True

@@ -21,11 +21,13 @@ class ViolationUpdater(CostUpdater):
         loss_module (LossModule): a loss with a ``cost_violation`` buffer of shape ``(k,)``.
 
     Keyword Args:
-        cost_limit (float or Tensor): limit of each expected episode cost, one number or k, in
-            the unit of the undiscounted episode cost.
+        cost_limit (float, Tensor or Mapping): limit of each expected episode cost, one number,
+            k, or one for each of ``cost_names``, in the unit of the undiscounted episode cost.
         pessimism (float, optional): standard errors of the batch's mean episode cost that are
             added to it, as of :class:`~torchrl_safe.objectives.MultiplierUpdater`. Defaults to
             ``0.0``.
+        cost_names (sequence of str, optional): names of the k costs, as of
+            :class:`~torchrl_safe.objectives.MultiplierUpdater`.
 
     Raises:
         ValueError: if the loss has no such buffer, or the limit or pessimism is not usable.
