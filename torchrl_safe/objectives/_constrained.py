@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,11 +18,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._checks import as_tensor
-from torchrl_safe.objectives._cost_critic import (
-    CostCritic,
-    CostKeys,
+from torchrl_safe.objectives._cost_critic import CostCritic, CostKeys
+from torchrl_safe.objectives._cost_values import (
     get_or_raise,
+    initial_multiplier,
     report_each,
 )
 
@@ -130,13 +128,6 @@ class ConstrainedPPO(ConstrainedLoss):
     _AcceptedKeys = PPOKeys
     default_keys = PPOKeys
 
-    parent_forward: ClassVar[Callable[..., TensorDictBase]]
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        # The next forward after those of ours. Compiled code cannot ask for it.
-        cls.parent_forward = staticmethod(super(CostCritic, cls).forward)
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
@@ -208,16 +199,3 @@ def evaluate(loss: PPOLoss, tensordict: TensorDictBase, shape: torch.Size) -> Po
 def forward_evaluated(loss: PPOLoss, tensordict: TensorDictBase, policy: Policy) -> TensorDictBase:
     """The loss's own forward, with a policy that has been evaluated already."""
     return type(loss).forward(_Evaluated(loss, policy), tensordict)
-
-
-def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:
-    """The multipliers to start with, shape ``(k,)``, checked."""
-    multiplier = as_tensor("multiplier_init", multiplier_init, torch.get_default_dtype())
-    if multiplier.shape not in ((), (num_costs,)):
-        raise ValueError(
-            f"multiplier_init must be one number or one for each of the {num_costs} costs, got "
-            f"shape {tuple(multiplier.shape)}."
-        )
-    if not (multiplier.isfinite() & (multiplier >= 0)).all():
-        raise ValueError(f"multiplier_init must be finite and not negative, got {multiplier_init}.")
-    return multiplier.expand(num_costs).clone()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -23,11 +23,10 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
 from torchrl_safe.objectives._checks import check_number
+from torchrl_safe.objectives._cost_values import CostValues, get_or_raise
 from torchrl_safe.objectives._reduction import counted, reduced
 from torchrl_safe.objectives.cost_gae import CostGAE
 from torchrl_safe.objectives.functional import scaled_advantages
-
-Self = TypeVar("Self", bound="CostCritic")
 
 
 @dataclass
@@ -40,7 +39,7 @@ class CostKeys:
     cost_value_target: NestedKey = "cost_value_target"
 
 
-class CostCritic(LossModule):
+class CostCritic(CostValues):
     """Adds a critic of k costs, its advantages and its loss to an on-policy loss of TorchRL.
 
     It stands before that loss among the bases, whose constructor gets all arguments but
@@ -71,9 +70,6 @@ class CostCritic(LossModule):
         cost_critic_coeff = check_number("cost_critic_coeff", cost_critic_coeff)
         # The parent's constructor already sets keys, before a module can be assigned.
         self._cost_critic_in_keys = list(cost_critic_network.in_keys)
-        self._cost_value_estimator: ValueEstimatorBase | None = None
-        self._listed_in_keys: list[NestedKey] = []
-        self._selected_out_keys: list[NestedKey] | None = None
         self._shared_keys: list[NestedKey] = []
         if device is not None:
             kwargs["device"] = device
@@ -91,55 +87,23 @@ class CostCritic(LossModule):
         if device is None:
             device = next((p.device for p in self.parameters()), torch.get_default_device())
         self.register_coeff_buffer("cost_critic_coeff", cost_critic_coeff, device=device)
-        self.register_state_dict_pre_hook(build_value_estimators)
-        self.register_load_state_dict_pre_hook(build_value_estimators)
         self._shared_keys = _written_by_actor(self)
         self._list_in_keys()
 
-    def make_cost_value_estimator(
-        self: Self, estimator: ValueEstimatorBase | None = None, **hyperparams: Any
-    ) -> Self:
-        """Chooses the value estimator of the costs.
+    def _default_cost_estimator(self, **hyperparams: Any) -> ValueEstimatorBase:
+        device = self.cost_critic_coeff.device
+        hyperparams = {"gamma": 0.99, "lmbda": 0.95, "device": device, **hyperparams}
+        return CostGAE(value_network=self.cost_critic_network, **hyperparams)
 
-        Args:
-            estimator (ValueEstimatorBase, optional): an estimator that handles k columns.
-                Defaults to a :class:`~torchrl_safe.objectives.CostGAE`.
-            **hyperparams: arguments of ``CostGAE``, for example ``gamma`` (default ``0.99``)
-                and ``lmbda`` (default ``0.95``). They act on the costs alone; the reward's are
-                those of :meth:`make_value_estimator`.
-
-        Returns:
-            The loss itself.
-
-        Raises:
-            TypeError: if ``estimator`` is no estimator.
-            ValueError: if both an estimator and hyperparameters are given.
-        """
-        if not isinstance(estimator, ValueEstimatorBase | None):
-            raise TypeError(f"estimator must be a ValueEstimatorBase, got {estimator!r}.")
-        if estimator is None:
-            device = self.cost_critic_coeff.device
-            hyperparams = {"gamma": 0.99, "lmbda": 0.95, "device": device, **hyperparams}
-            estimator = CostGAE(value_network=self.cost_critic_network, **hyperparams)
-        elif hyperparams:
-            raise ValueError(
-                f"Pass an estimator or hyperparameters, not both: got {estimator} and "
-                f"{sorted(hyperparams)}."
-            )
-        self._check_cost_value_estimator(estimator)
-        self._cost_value_estimator = estimator
-        self._set_cost_estimator_keys()
-        return self
-
-    def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
-        """Raises ValueError if the loss cannot use it; any that handles k columns will do."""
-
-    @property
-    def cost_value_estimator(self) -> ValueEstimatorBase:
-        """The value estimator of the costs."""
-        if self._cost_value_estimator is None:
-            self.make_cost_value_estimator()
-        return self._cost_value_estimator
+    def _cost_estimator_keys(self) -> dict[str, NestedKey]:
+        return {
+            "advantage": self.tensor_keys.cost_advantage,
+            "value_target": self.tensor_keys.cost_value_target,
+            "value": self.tensor_keys.cost_value,
+            "reward": self.tensor_keys.cost,
+            "done": self.tensor_keys.done,
+            "terminated": self.tensor_keys.terminated,
+        }
 
     @torch.no_grad()
     def estimate_advantages(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -307,49 +271,10 @@ class CostCritic(LossModule):
             keys.append("cost_value_clip_fraction")
         return keys
 
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        # Listed at each call, since options can be set later.
-        if self._selected_out_keys is None:
-            return [*super().out_keys, *self._own_out_keys()]
-        return self._selected_out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._selected_out_keys = values
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        # Listed when the keys are set: compiled code reads them at each call.
-        return self._listed_in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._listed_in_keys = values
-
-    def _list_in_keys(self) -> None:
+    def _own_in_keys(self) -> list[NestedKey]:
         keys = [key for key in self._cost_critic_in_keys if key not in self._shared_keys]
         keys = [*keys, *(unravel_key(("next", key)) for key in keys)]
-        keys.append(unravel_key(("next", self.tensor_keys.cost)))
-        inherited = [unravel_key(key) for key in super().in_keys]
-        self._listed_in_keys = list(dict.fromkeys([*inherited, *keys]))
-
-    def set_keys(self, **kwargs: Any) -> None:
-        """Sets the names of entries, as :meth:`torchrl.objectives.LossModule.set_keys`."""
-        super().set_keys(**kwargs)
-        self._list_in_keys()
-        self._set_cost_estimator_keys()
-
-    def _set_cost_estimator_keys(self) -> None:
-        if self._cost_value_estimator is not None:
-            self._cost_value_estimator.set_keys(
-                advantage=self.tensor_keys.cost_advantage,
-                value_target=self.tensor_keys.cost_value_target,
-                value=self.tensor_keys.cost_value,
-                reward=self.tensor_keys.cost,
-                done=self.tensor_keys.done,
-                terminated=self.tensor_keys.terminated,
-            )
+        return [*keys, unravel_key(("next", self.tensor_keys.cost))]
 
 
 def _written_by_actor(loss: LossModule) -> list[NestedKey]:
@@ -361,23 +286,3 @@ def _written_by_actor(loss: LossModule) -> list[NestedKey]:
     read = [unravel_key(key) for critic in critics if critic is not None for key in critic.in_keys]
     written = [unravel_key(key) for key in actor.det_part.out_keys]
     return [key for key in dict.fromkeys(read) if key in written]
-
-
-def get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """The entry, or an error that names it."""
-    tensor = tensordict.get(key, None)
-    if tensor is None:
-        raise KeyError(f"The key {key!r} was not found in the input tensordict.")
-    return tensor
-
-
-def report_each(losses: TensorDictBase, name: str, values: Tensor) -> None:
-    """Adds an output for each cost, from a buffer of shape ``(k,)``."""
-    # Scalars, since trainers and loggers keep no others; cloned, since buffers change in place.
-    for index, value in enumerate(values.clone().unbind()):
-        losses.set(f"{name}_{index}", value)
-
-
-def build_value_estimators(loss: CostCritic, *_: Any) -> None:
-    # Their buffers are part of the state: a fresh and a used loss then have the same entries.
-    _ = loss.value_estimator, loss.cost_value_estimator

@@ -18,7 +18,7 @@ from torchrl.objectives.value import GAE, ValueEstimatorBase
 from torchrl_safe.objectives._actor import divergence
 from torchrl_safe.objectives._checks import check_discount
 from torchrl_safe.objectives._constrained import ConstrainedPPO
-from torchrl_safe.objectives._cost_critic import get_or_raise
+from torchrl_safe.objectives._cost_values import get_or_raise
 from torchrl_safe.objectives._reduction import reduced
 
 

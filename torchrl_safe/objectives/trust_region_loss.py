@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives._constrained import ConstrainedPPO
-from torchrl_safe.objectives._cost_critic import get_or_raise
+from torchrl_safe.objectives._cost_values import get_or_raise
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.functional import penalized_advantage
 

@@ -20,7 +20,7 @@ from torchrl_safe.objectives._actor import (
     in_precision,
 )
 from torchrl_safe.objectives._checks import as_number, check_number
-from torchrl_safe.objectives._cost_critic import get_or_raise
+from torchrl_safe.objectives._cost_values import get_or_raise
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.functional import penalized_advantage
 from torchrl_safe.objectives.trust_region import (
