@@ -11,8 +11,8 @@ NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrai
 	pid_control ppo_lagrangian sac_lagrangian trust_region trust_region_loss trust_region_optimum \
 	trust_region_step violation))
 
-.PHONY: train test test-kernels test-slow test-wheel compare paper sweep profile gallery bench draws \
-	ray docs lint format type clean
+.PHONY: train test test-kernels test-slow test-wheel compare paper sweep profile gallery bench draws ray \
+	docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)

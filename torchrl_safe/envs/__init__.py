@@ -28,6 +28,7 @@ from torchrl_safe.envs.costs import (
 )
 from torchrl_safe.envs.early_termination import EarlyTermination
 from torchrl_safe.envs.frame_skip import FrameSkip
+from torchrl_safe.envs.home import find_home
 from torchrl_safe.envs.human import Human
 from torchrl_safe.envs.kinematics import (
     BulletInverseKinematics,
@@ -105,6 +106,7 @@ __all__ = [
     "Task",
     "Workspace",
     "World",
+    "find_home",
     "paper_env",
     "paper_observation",
 ]

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.checks import check_array, check_positive
+from torchrl_safe.envs.checks import check_array, check_flag, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
 from torchrl_safe.envs.state import ArmState, Array
@@ -165,6 +165,7 @@ class JointDelta:
     def __post_init__(self) -> None:
         check_positive(step=self.step)
         _check_bound(self.bound)
+        check_flag(respect_limits=self.respect_limits)
         if self.finger_step is not None:
             check_positive(finger_step=self.finger_step)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_array, check_positive
+from torchrl_safe.envs.checks import check_array, check_flag, check_positive
 
 #: Duration of one physics substep, s (PyBullet's default).
 SUBSTEP = 1 / 240
@@ -57,6 +57,13 @@ class Scene:
         check_array("gravity", self.gravity, ())
         if self.motor_gain is not None:
             check_positive(motor_gain=self.motor_gain)
+        check_flag(
+            free_fingers=self.free_fingers,
+            merged_links=self.merged_links,
+            motor_limits=self.motor_limits,
+            urdf_inertia=self.urdf_inertia,
+            fresh_links=self.fresh_links,
+        )
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
         raise ValueError(f"{name} must be positive, from 1e-18 to 1e18, got {value!r}.")
     if not 0 <= number <= _LARGEST:
         raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
+    if number > _LARGE:  # Times a loss it would soon be infinite.
+        raise ValueError(f"{name} must be at most 1e18, got {value!r}.")
     return number
 
 

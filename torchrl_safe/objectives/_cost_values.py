@@ -158,8 +158,12 @@ def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tenso
             f"multiplier_init must be one number or one for each of the {num_costs} costs, got "
             f"shape {tuple(multiplier.shape)}."
         )
-    if not (multiplier.isfinite() & (multiplier >= 0)).all():
-        raise ValueError(f"multiplier_init must be finite and not negative, got {multiplier_init}.")
+    # Near the end of single precision its product with an advantage would be infinite.
+    if not ((multiplier >= 0) & (multiplier <= 1e18)).all():
+        raise ValueError(
+            "multiplier_init must be finite and not negative, and at most 1e18, got "
+            f"{multiplier_init}."
+        )
     return multiplier.expand(num_costs).clone()
 
 
