@@ -23,11 +23,11 @@ from torchrl_safe.objectives import (
     ViolationUpdater,
     penalized_advantage,
 )
-from torchrl_safe.objectives._surrogate import clipped_cost_surrogate
-from torchrl_safe.objectives.crpo import rectified_advantage
-from torchrl_safe.objectives.cup import projection_objective
-from torchrl_safe.objectives.ipo import log_barrier
-from torchrl_safe.objectives.p3o import exact_penalty
+from torchrl_safe.objectives.on_policy.crpo import rectified_advantage
+from torchrl_safe.objectives.on_policy.cup import projection_objective
+from torchrl_safe.objectives.on_policy.ipo import log_barrier
+from torchrl_safe.objectives.on_policy.p3o import exact_penalty
+from torchrl_safe.objectives.on_policy.surrogate import clipped_cost_surrogate
 from torchrl_safe.testing import make_actor, make_batch, make_critic, make_networks
 
 

@@ -137,3 +137,22 @@ def penalized_advantage(
         )
     penalized = advantage - (lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
     return penalized / (1 + lagrange_multiplier.sum()) if rescale else penalized
+
+
+def per_step(episode_length: float | None, gamma: Tensor) -> Tensor | float:
+    r"""What turns an amount per episode into one per step, the unit of a surrogate.
+
+    A surrogate is a mean over steps, a violation one over whole episodes. The papers take
+    :math:`1 - \gamma`, as if every episode had :math:`1 / (1 - \gamma)` steps: one of 40 steps,
+    discounted by 0.99, is then taken for one of 100, and a change of the policy for 2.5 times the
+    change of its cost.
+
+    Args:
+        episode_length (float, optional): mean number of steps of an episode; if ``None``,
+            :math:`1 / (1 - \gamma)`.
+        gamma (Tensor): discount of the costs.
+
+    Returns:
+        The share of one step in an episode.
+    """
+    return 1 - gamma if episode_length is None else 1 / episode_length

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution, kl_divergence
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._cost_values import get_or_raise
+from torchrl_safe.objectives.critics.cost_values import get_or_raise
 
 
 class ActorCopy:

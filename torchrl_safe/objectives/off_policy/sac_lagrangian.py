@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from torchrl_safe.objectives._cost_q_critics import CostCriticsMixin
+from torchrl_safe.objectives.critics.cost_q_critics import CostCriticsMixin
 
 
 class SACLagrangianLoss(CostCriticsMixin, SACLoss):

@@ -7,10 +7,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._constrained import ConstrainedPPO
-from torchrl_safe.objectives._cost_values import get_or_raise
 from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.critics.cost_values import get_or_raise
 from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 
 
 class TrustRegionLoss(ConstrainedPPO, PPOLoss):

@@ -13,7 +13,7 @@ from torchrl.envs.utils import step_mdp
 from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_safe.objectives._cost_q_critics import CostCriticsMixin
+from torchrl_safe.objectives.critics.cost_q_critics import CostCriticsMixin
 
 
 class TD3LagrangianLoss(CostCriticsMixin, TD3Loss):

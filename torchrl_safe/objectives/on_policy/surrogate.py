@@ -9,9 +9,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives._constrained import ConstrainedPPO, Policy
+from torchrl_safe.objectives._checks import check_episode_length, check_length_known
 from torchrl_safe.objectives._reduction import reduced
-from torchrl_safe.objectives.violation import check_episode_length, check_length_known
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO, Policy
 
 
 def clipped_cost_surrogate(

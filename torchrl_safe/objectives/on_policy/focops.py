@@ -11,11 +11,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._actor import divergence
 from torchrl_safe.objectives._checks import as_number, check_number
-from torchrl_safe.objectives._constrained import ConstrainedPPO
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
+from torchrl_safe.objectives.on_policy.policies import divergence
 
 
 class FOCOPSLoss(ConstrainedPPO, PPOLoss):

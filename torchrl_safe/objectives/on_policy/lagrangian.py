@@ -7,9 +7,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._constrained import ConstrainedLoss
-from torchrl_safe.objectives._wrapped import WrappedLoss
 from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedLoss
+from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
 
 
 class LagrangianLoss(ConstrainedLoss, WrappedLoss):

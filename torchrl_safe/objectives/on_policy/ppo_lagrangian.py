@@ -6,8 +6,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives._constrained import ConstrainedPPO
 from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 
 
 class PPOLagrangianLoss(ConstrainedPPO, ClipPPOLoss):

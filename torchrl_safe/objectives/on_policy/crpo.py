@@ -9,8 +9,8 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._constrained import ConstrainedLoss
-from torchrl_safe.objectives._wrapped import WrappedLoss
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedLoss
+from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
 
 
 def rectified_advantage(

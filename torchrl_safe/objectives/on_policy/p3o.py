@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._surrogate import CostSurrogate
-from torchrl_safe.objectives.violation import per_step
+from torchrl_safe.objectives.functional import per_step
+from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
 def exact_penalty(

@@ -23,9 +23,9 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._cost_values import CostValues, get_or_raise
 from torchrl_safe.objectives._reduction import counted, reduced
-from torchrl_safe.objectives.cost_gae import CostGAE
+from torchrl_safe.objectives.critics.cost_gae import CostGAE
+from torchrl_safe.objectives.critics.cost_values import CostValues, get_or_raise
 from torchrl_safe.objectives.functional import scaled_advantages
 
 
@@ -110,7 +110,7 @@ class CostCritic(CostValues):
         """Writes advantages and value targets of reward and costs, for a whole batch.
 
         They are scaled over the whole batch, as
-        :func:`~torchrl_safe.objectives.functional.scaled_advantages` says: the reward advantage is
+        :func:`~torchrl_safe.objectives.scaled_advantages` says: the reward advantage is
         standardized (unless the loss has an ``advantage_norm``, which scales it instead), the cost
         advantages are centred (by ``CostGAE``; another estimator decides for itself). Steps that
         the loss leaves out, such as those that pad a trajectory (``("collector", "mask")``), do

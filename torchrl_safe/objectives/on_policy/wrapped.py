@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives._constrained import evaluate, forward_evaluated
-from torchrl_safe.objectives._cost_critic import CostCritic, CostKeys
+from torchrl_safe.objectives.critics.cost_critic import CostCritic, CostKeys
+from torchrl_safe.objectives.on_policy.constrained import evaluate, forward_evaluated
 
 _COST_KEYS = frozenset(field.name for field in fields(CostKeys))
 # Options that a ConstrainedLoss reads and that not every loss has.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._cost_updater import CostUpdater
+from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
 
 class ViolationUpdater(CostUpdater):
@@ -47,38 +46,3 @@ class ViolationUpdater(CostUpdater):
 
     def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
         buffer.copy_(self._violation(episode_cost))
-
-
-def check_episode_length(episode_length: float | None) -> float | None:
-    """Returns the value; raises ValueError unless it is positive or None."""
-    if episode_length is None:
-        return None
-    return check_number("episode_length", episode_length, positive=True)
-
-
-def check_length_known(episode_length: float | None, gamma: Tensor) -> None:
-    """Raises ValueError if neither the option nor the discount tells the length of an episode."""
-    if episode_length is None and not gamma < 1:
-        raise ValueError(
-            "episode_length must be given if gamma of the costs is 1 or more, got None and gamma "
-            f"{gamma.item()}."
-        )
-
-
-def per_step(episode_length: float | None, gamma: Tensor) -> Tensor | float:
-    r"""What turns an amount per episode into one per step, the unit of a surrogate.
-
-    A surrogate is a mean over steps, a violation one over whole episodes. The papers take
-    :math:`1 - \gamma`, as if every episode had :math:`1 / (1 - \gamma)` steps: one of 40 steps,
-    discounted by 0.99, is then taken for one of 100, and a change of the policy for 2.5 times the
-    change of its cost.
-
-    Args:
-        episode_length (float, optional): mean number of steps of an episode; if ``None``,
-            :math:`1 / (1 - \gamma)`.
-        gamma (Tensor): discount of the costs.
-
-    Returns:
-        The share of one step in an episode.
-    """
-    return 1 - gamma if episode_length is None else 1 / episode_length

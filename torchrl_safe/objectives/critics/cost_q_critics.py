@@ -14,13 +14,13 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
-from torchrl_safe.objectives._cost_values import (
+from torchrl_safe.objectives.critics.cost_td0 import CostTD0
+from torchrl_safe.objectives.critics.cost_values import (
     CostValues,
     get_or_raise,
     initial_multiplier,
     report_each,
 )
-from torchrl_safe.objectives.cost_td0 import CostTD0
 from torchrl_safe.objectives.functional import penalized_advantage
 
 

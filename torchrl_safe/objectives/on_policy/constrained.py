@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._cost_critic import CostCritic, CostKeys
-from torchrl_safe.objectives._cost_values import (
+from torchrl_safe.objectives.critics.cost_critic import CostCritic, CostKeys
+from torchrl_safe.objectives.critics.cost_values import (
     get_or_raise,
     initial_multiplier,
     report_each,
