@@ -43,6 +43,22 @@ def check_discount(gamma: Tensor) -> None:
         raise ValueError(f"gamma of the costs must be below 1, got {gamma.item()}.")
 
 
+def check_episode_length(episode_length: float | None) -> float | None:
+    """Returns the value; raises ValueError unless it is positive or None."""
+    if episode_length is None:
+        return None
+    return check_number("episode_length", episode_length, positive=True)
+
+
+def check_length_known(episode_length: float | None, gamma: Tensor) -> None:
+    """Raises ValueError if neither the option nor the discount tells the length of an episode."""
+    if episode_length is None and not gamma < 1:
+        raise ValueError(
+            "episode_length must be given if gamma of the costs is 1 or more, got None and gamma "
+            f"{gamma.item()}."
+        )
+
+
 def as_number(value: Any) -> float:
     """The value of a number or of a tensor with one element, NaN of anything else."""
     if isinstance(value, Tensor):

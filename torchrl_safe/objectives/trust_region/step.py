@@ -12,33 +12,35 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe._checks import check_count
-from torchrl_safe.objectives._actor import (
+from torchrl_safe.objectives._checks import (
+    as_number,
+    check_episode_length,
+    check_length_known,
+    check_number,
+)
+from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.critics.cost_values import get_or_raise
+from torchrl_safe.objectives.functional import penalized_advantage, per_step
+from torchrl_safe.objectives.on_policy.policies import (
     ActorCopy,
     actor_parameters,
     divergence,
     importance_weight,
     in_precision,
 )
-from torchrl_safe.objectives._checks import as_number, check_number
-from torchrl_safe.objectives._cost_critic import get_or_raise
-from torchrl_safe.objectives.trust_region import (
-    NotPositiveDefiniteError,
-    backtracking_line_search,
-    conjugate_gradient,
-    fisher_vector_product,
-    flat_gradient,
-)
-from torchrl_safe.objectives.trust_region_loss import TrustRegionLoss
-from torchrl_safe.objectives.trust_region_methods import (
+from torchrl_safe.objectives.trust_region.loss import TrustRegionLoss
+from torchrl_safe.objectives.trust_region.methods import (
     TRPO,
     TrustRegionMethod,
     TrustRegionProblem,
     TrustRegionSolution,
 )
-from torchrl_safe.objectives.violation import (
-    check_episode_length,
-    check_length_known,
-    per_step,
+from torchrl_safe.objectives.trust_region.solver import (
+    NotPositiveDefiniteError,
+    backtracking_line_search,
+    conjugate_gradient,
+    fisher_vector_product,
+    flat_gradient,
 )
 
 
@@ -95,10 +97,10 @@ class TrustRegionStep:
         damping (float, optional): multiple of the identity added to the Fisher matrix.
             Defaults to ``0.1``.
         cg_iterations (int, optional): iterations of
-            :func:`~torchrl_safe.objectives.trust_region.conjugate_gradient`.
+            :func:`~torchrl_safe.objectives.trust_region.solver.conjugate_gradient`.
             Defaults to ``10``.
         shrink (float, optional): see
-            :func:`~torchrl_safe.objectives.trust_region.backtracking_line_search`.
+            :func:`~torchrl_safe.objectives.trust_region.solver.backtracking_line_search`.
             Defaults to ``0.8``.
         max_backtracks (int, optional): see there. Defaults to ``10``.
         dtype (torch.dtype, optional): precision in which the step is found: a copy of the actor
@@ -230,6 +232,10 @@ class TrustRegionStep:
         advantage = loss._maybe_normalize_advantage(
             data.get(keys.advantage), data, update_norm=False
         )
+        if isinstance(loss, TrustRegionLoss):
+            advantage = penalized_advantage(
+                advantage, data.get(keys.cost_advantage), loss.lagrange_multiplier
+            )
         cost_advantage = data.get(keys.cost_advantage) if self.method.constrained else None
         for key, values in zip(needed, (advantage, cost_advantage), strict=False):
             if values is not None and values.shape[-1] != 1:
@@ -252,7 +258,7 @@ class TrustRegionStep:
 
     def _mean(self, values: Tensor, batch: _Batch) -> Tensor:
         # As TorchRL reduces a loss, so that masked steps count nowhere.
-        return self.loss_module._reduce_loss(values, batch.data)
+        return reduced(self.loss_module, values, batch.data)
 
     def _mean_kl(self, fixed: Distribution, distribution: Distribution, batch: _Batch) -> Tensor:
         return self._mean(divergence(fixed, distribution).unsqueeze(-1), batch)

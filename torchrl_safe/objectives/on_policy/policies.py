@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution, kl_divergence
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._cost_critic import get_or_raise
+from torchrl_safe.objectives.critics.cost_values import get_or_raise
 
 
 class ActorCopy:
@@ -30,7 +30,9 @@ class ActorCopy:
 
     def __init__(self, loss: PPOLoss, dtype: torch.dtype) -> None:
         self.dtype = dtype
-        self._actor, self._functional = loss.actor_network, loss.functional
+        self._actor = loss.actor_network
+        # A functional loss keeps its actor without parameters.
+        self._options = {"preserve_module_state": False} if loss.functional else {}
         source = loss.actor_network_params
         if not loss.functional:
             source = TensorDict.from_module(loss.actor_network)
@@ -42,16 +44,14 @@ class ActorCopy:
                 copies[id(tensor)].requires_grad_(tensor.requires_grad)
             return copies[id(tensor)]
 
-        self._state = source.apply(copy)
+        self._copies = source.apply(copy)
         self._originals = actor_parameters(loss)
         self.parameters = [copies[id(parameter)] for parameter in self._originals]
         self._start = [parameter.detach().clone() for parameter in self.parameters]
 
     def distribution(self, tensordict: TensorDictBase) -> Distribution:
         """The policy in the states of a batch, which must be in the precision of the copy."""
-        # A functional loss keeps its actor without parameters.
-        options = {"preserve_module_state": False} if self._functional else {}
-        with self._state.to_module(self._actor, **options):
+        with self._copies.to_module(self._actor, **self._options):
             try:
                 return self._actor.get_dist(tensordict.clone(False))
             except RuntimeError as error:

@@ -8,14 +8,18 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictParams,
+)
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from torchrl_safe.objectives._cost_q_critics import CostCriticsMixin
+from torchrl_safe.objectives.critics.cost_q_critics import CostCriticsMixin
 
 
 class SACLagrangianLoss(CostCriticsMixin, SACLoss):
@@ -158,7 +162,15 @@ class SACLagrangianLoss(CostCriticsMixin, SACLoss):
         )
 
     # The parent keeps the actions it draws to itself, and a second draw would be another action
-    # and move the random numbers: the two methods that draw are written anew.
+    # and move the random numbers: the two methods that draw are written anew. Of TorchRL's private
+    # names they need _alpha, which keeps the temperature within its bounds as it is read, and
+    # _compute_target_v2, the smallest method around the next action.
+
+    def _qvalue(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
+        """Values of the N reward critics, shape ``(N, *B, 1)``."""
+        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        values = self._ensemble(self.qvalue_network, inputs, params)
+        return values.get(self.tensor_keys.state_action_value)
 
     def _draw_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         with (
@@ -185,9 +197,7 @@ class SACLagrangianLoss(CostCriticsMixin, SACLoss):
         action, log_prob = self._draw_next_action(following)
         following.set(keys.action, action)
         tensordict.set("next", following)  # Where cost_qvalue_loss finds the action.
-        value = self._vmap_qnetworkN0(following, self.target_qvalue_network_params).get(
-            keys.state_action_value
-        )
+        value = self._qvalue(following, self.target_qvalue_network_params)
         value = (value - self._alpha * log_prob.unsqueeze(-1)).min(0)[0]
         data = tensordict.clone(False)
         data.set(unravel_key(("next", self.value_estimator.tensor_keys.value)), value)
@@ -204,16 +214,9 @@ class SACLagrangianLoss(CostCriticsMixin, SACLoss):
         """
         action, log_prob = self._draw_action(tensordict)
         acted = tensordict.copy().set(self.tensor_keys.action, action)
-        value = self._vmap_qnetworkN0(
-            acted.select(*self.qvalue_network.in_keys, strict=False),
-            self._cached_detached_qvalue_params,
-        ).get(self.tensor_keys.state_action_value)
+        value = self._qvalue(acted, self.qvalue_network_params.detach())
         objective = value.min(0)[0].squeeze(-1) - self._alpha * log_prob
-        loss = self._reduce_loss(
-            -self.penalized_objective(objective, acted),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
+        loss = self._reduced(-self.penalized_objective(objective, acted), tensordict)
         return loss, {"log_prob": log_prob.detach()}
 
     def _report_multipliers(self, losses: TensorDictBase) -> None:

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from torchrl_safe.objectives.trust_region import cpo_weights, pcpo_weight, trpo_weight
+from torchrl_safe.objectives.trust_region.solver import cpo_weights, pcpo_weight, trpo_weight
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class TRPO(TrustRegionMethod):
     """Trust region policy optimization: the natural gradient, up to the bound of the divergence.
 
     Schulman et al. 2015 (https://arxiv.org/abs/1502.05477); see
-    :func:`~torchrl_safe.objectives.trust_region.trpo_weight`. On a
+    :func:`~torchrl_safe.objectives.trust_region.solver.trpo_weight`. On a
     :class:`~torchrl_safe.objectives.TrustRegionLoss` whose multipliers a
     :class:`~torchrl_safe.objectives.MultiplierUpdater` moves, it is TRPO-Lagrangian.
 
@@ -110,7 +110,7 @@ class CPO(TrustRegionMethod):
     """Constrained policy optimization: the best step that keeps the cost below its limit.
 
     Achiam et al. 2017 (https://arxiv.org/abs/1705.10528); the closed form and its four cases
-    are those of :func:`~torchrl_safe.objectives.trust_region.cpo_weights`. It has one cost:
+    are those of :func:`~torchrl_safe.objectives.trust_region.solver.cpo_weights`. It has one cost:
     with k of them the dual has 2^k sets of active constraints and no closed form. For more,
     add up the costs, or use :class:`TRPO` with a multiplier for each.
 
@@ -154,9 +154,9 @@ class PCPO(TrustRegionMethod):
     """Projection-based constrained policy optimization: a TRPO step, projected on the limit.
 
     Yang et al. 2020 (https://arxiv.org/abs/2010.03152); see
-    :func:`~torchrl_safe.objectives.trust_region.pcpo_weight`. Far above the limit the projection
-    lies outside the trust region; the step then ends at its edge, on the way there (in the paper
-    nothing bounds it). It has one cost, for the reason given at :class:`CPO`: the projection on
+    :func:`~torchrl_safe.objectives.trust_region.solver.pcpo_weight`. Far above the limit the
+    projection lies outside the trust region; the step then ends at its edge, on the way there (in
+    the paper nothing bounds it). It has one cost, for the reason given at :class:`CPO`: the projection on
     several half-spaces has no closed form either.
 
     Args:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._actor import actor_distribution, importance_weight
-from torchrl_safe.objectives._cost_critic import CostKeys, get_or_raise
-from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
-from torchrl_safe.objectives.violation import ViolationMixin
+from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.critics.cost_values import get_or_raise
+from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 
 
-class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
+class TrustRegionLoss(ConstrainedPPO, PPOLoss):
     r"""Unclipped surrogates of the reward and of k costs, for TRPO-Lagrangian, CPO and PCPO.
 
     With the ratio :math:`w = \pi_\theta(a|s) / \pi_{\theta_k}(a|s)`, ``"loss_objective"`` is
@@ -72,41 +68,15 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
         >>> from torchrl_safe.objectives import CPO, TrustRegionStep, ViolationUpdater
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=TanhNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 1), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
-        >>> loss = TrustRegionLoss(actor, critic, cost_critic, entropy_bonus=False)
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> loss = TrustRegionLoss(*make_networks(), entropy_bonus=False)
         >>> critics = [loss.critic_network_params, loss.cost_critic_network_params]
         >>> optimizer = torch.optim.Adam([p for params in critics for p in params.parameters()])
         >>> updater = ViolationUpdater(loss, cost_limit=1.0)
         >>> actor_step = TrustRegionStep(loss, CPO(), max_kl=0.01)
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> done[:, -1] = True
-        >>> data = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     data = actor(data)
-        >>> data["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 1),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> updater.step(torch.tensor([[2.0], [3.0], [1.0]]))  # one cost for each episode
-        >>> data = loss.estimate_advantages(data).reshape(-1)
+        >>> updater.step(torch.tensor([[2.0], [3.0], [1.0]]))  # a row for each episode
+        >>> data = loss.estimate_advantages(make_batch()).reshape(-1)
         >>> info = actor_step.step(data)
         >>> bool(info["kl"] <= 0.01)
         True
@@ -115,32 +85,13 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
         >>> optimizer.step()
     """
 
-    @dataclass
-    class _AcceptedKeys(CostKeys, PPOLoss._AcceptedKeys):
-        pass
+    cost_buffers = ("lagrange_multiplier", "cost_violation")
 
-    default_keys = _AcceptedKeys
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
-        cost_critic_network: TensorDictModuleBase,
-        *,
-        num_costs: int = 1,
-        multiplier_init: float | Tensor = 0.0,
-        cost_critic_coeff: float = 1.0,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            actor_network,
-            critic_network,
-            cost_critic_network=cost_critic_network,
-            num_costs=num_costs,
-            multiplier_init=multiplier_init,
-            cost_critic_coeff=cost_critic_coeff,
-            **kwargs,
-        )
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+        return self.unconstrained(tensordict, mixed)
 
     # Not among the outputs of forward: trainers add up everything there that is named a loss.
     def cost_surrogate_loss(self, tensordict: TensorDictBase) -> Tensor:
@@ -159,10 +110,9 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
         """
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
         self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
-        distribution = actor_distribution(self, tensordict)
-        weight = importance_weight(self, distribution, tensordict, cost_advantage.shape[:-1])
-        surrogates = (weight * cost_advantage).split(1, -1)
-        return torch.stack([self._reduce_loss(surrogate, tensordict) for surrogate in surrogates])
+        ratio = self.evaluate(tensordict.clone(False)).ratio()
+        surrogates = (ratio * cost_advantage).split(1, -1)
+        return torch.stack([reduced(self, surrogate, tensordict) for surrogate in surrogates])
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of both critics, without the policy, which the step has already moved.
@@ -177,9 +127,11 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
         Raises:
             KeyError: if a value target is missing.
         """
+        tensordict = tensordict.clone(False)
+        tensordict.update(self.actor_features(tensordict))
         losses = {"loss_cost_critic": self.loss_cost_critic(tensordict)[0]}
         if self.critic_coeff is not None:
-            losses["loss_critic"] = self.loss_critic(tensordict.clone(False))[0]
+            losses["loss_critic"] = self.loss_critic(tensordict)[0]
         return TensorDict(
-            {name: self._reduce_loss(loss, tensordict).squeeze(-1) for name, loss in losses.items()}
+            {name: reduced(self, loss, tensordict).squeeze(-1) for name, loss in losses.items()}
         )

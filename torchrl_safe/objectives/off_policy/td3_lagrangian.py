@@ -6,17 +6,14 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictParams
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_safe.objectives._cost_q_critics import CostCriticsMixin
-
-# TorchRL makes a property of the list TD3Loss.out_keys when a TD3Loss itself is first created, and
-# select_out_keys needs the property, also in subclasses.
-TD3Loss.__new__(TD3Loss)
+from torchrl_safe.objectives.critics.cost_q_critics import CostCriticsMixin
 
 
 class TD3LagrangianLoss(CostCriticsMixin, TD3Loss):
@@ -99,12 +96,10 @@ class TD3LagrangianLoss(CostCriticsMixin, TD3Loss):
     # The parent keeps its next action to itself, and its smoothing is random: drawing it again
     # would be another action and move the random numbers. Both methods are written anew.
 
-    def _qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+    def _qvalue(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
         """Values of the N reward critics, shape ``(N, *B)``."""
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
-        values = self._vmap_qvalue_network00(
-            inputs.expand(self.num_qvalue_nets, *inputs.batch_size), params
-        )
+        values = self._ensemble(self.qvalue_network, inputs, params, copies=self.num_qvalue_nets)
         return values.get(self.tensor_keys.state_action_value).squeeze(-1)
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -118,12 +113,8 @@ class TD3LagrangianLoss(CostCriticsMixin, TD3Loss):
         """
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             acted = self.actor_network(tensordict.copy())
-        value = self._qvalue(acted, self._cached_detach_qvalue_network_params)
-        loss = self._reduce_loss(
-            -self.penalized_objective(value[0], acted),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
+        value = self._qvalue(acted, self.qvalue_network_params.detach())
+        loss = self._reduced(-self.penalized_objective(value[0], acted), tensordict)
         return loss, {"state_action_value_actor": value.detach()}
 
     @torch.no_grad()
@@ -166,5 +157,4 @@ class TD3LagrangianLoss(CostCriticsMixin, TD3Loss):
             "pred_value": value.detach(),
             "target_value": target.detach(),
         }
-        weights = self._maybe_get_priority_weight(tensordict)
-        return self._reduce_loss(loss.sum(0), tensordict=tensordict, weights=weights), metadata
+        return self._reduced(loss.sum(0), tensordict), metadata

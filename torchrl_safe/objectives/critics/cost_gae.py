@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
@@ -13,6 +12,8 @@ from torch import Tensor
 from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives._checks import check_share
+from torchrl_safe.objectives._reduction import expanded_mask
+from torchrl_safe.objectives.functional import centred
 
 
 class CostGAE(GAE):
@@ -113,7 +114,7 @@ class CostGAE(GAE):
 
     @vectorized.setter
     def vectorized(self, value: bool | None) -> None:
-        self._vectorized = value
+        GAE.vectorized.fset(self, value)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
@@ -169,13 +170,4 @@ class CostGAE(GAE):
     def _normalize_advantage(
         self, adv: Tensor, valid: Tensor | None = None, groups: Tensor | None = None
     ) -> Tensor:
-        return centred(adv, None if valid is None else self._expand_to_match(valid, adv))
-
-
-def centred(values: Tensor, valid: Tensor | None) -> Tensor:
-    """Takes off the mean of each column, over the rows that are valid."""
-    rows = tuple(range(values.ndim - 1))
-    if valid is None:
-        return values - values.mean(rows, keepdim=True)
-    count = valid.sum(rows, keepdim=True).clamp_min(1)
-    return values - torch.where(valid, values, 0.0).sum(rows, keepdim=True) / count
+        return centred(adv, None if valid is None else expanded_mask(valid, adv))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,10 +15,11 @@ from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE, ValueEstimatorBase
 
-from torchrl_safe.objectives._actor import divergence
 from torchrl_safe.objectives._checks import check_discount
-from torchrl_safe.objectives._cost_critic import CostKeys, get_or_raise
-from torchrl_safe.objectives._lagrange import LagrangeMultiplierMixin
+from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.critics.cost_values import get_or_raise
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
+from torchrl_safe.objectives.on_policy.policies import divergence
 
 
 def projection_objective(
@@ -60,7 +60,7 @@ def projection_objective(
     return kl + scale * ratio * cost
 
 
-class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
+class CUPLoss(ConstrainedPPO, ClipPPOLoss):
     r"""Improves the policy with clipped PPO, then projects it towards the limits of k costs.
 
     Presented in "Constrained Update Projection Approach to Safe Policy Optimization", Yang et al.
@@ -110,50 +110,20 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
         >>> from torchrl_safe.objectives import DualAscent
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
-        >>> loss = CUPLoss(actor, critic, cost_critic, num_costs=2)
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> loss = CUPLoss(*make_networks(num_costs=2), num_costs=2)
         >>> updater = DualAscent(loss, cost_limit=torch.tensor([1.0, 5.0]), lr=0.01)
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> batch = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     batch = actor(batch)
-        >>> batch["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 2),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
-        >>> losses = loss(loss.estimate_advantages(batch).reshape(-1))
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))  # a row for each episode
+        >>> data = loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1)
+        >>> losses = loss(data)  # The first phase: some epochs of these,
         >>> loss.start_projection()
-        >>> projection = loss.projection_loss(batch.reshape(-1))
+        >>> projection = loss.projection_loss(data)  # then some of these.
         >>> sorted(projection.keys()), projection["kl"]
         (['kl', 'loss_projection'], tensor(0.))
     """
 
     improved_actor_params: TensorDictParams
-
-    @dataclass
-    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,
@@ -169,7 +139,7 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         super().__init__(
             actor_network,
             critic_network,
-            cost_critic_network=cost_critic_network,
+            cost_critic_network,
             num_costs=num_costs,
             multiplier_init=multiplier_init,
             cost_critic_coeff=cost_critic_coeff,
@@ -183,6 +153,11 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         if self.functional:
             return self.actor_network_params
         return TensorDict.from_module(self.actor_network)
+
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        return self.unconstrained(tensordict, advantage)
 
     def start_projection(self) -> None:
         """Keeps the policy as it is now, for :meth:`projection_loss` to stay near it."""
@@ -205,21 +180,16 @@ class CUPLoss(LagrangeMultiplierMixin, ClipPPOLoss):
         """
         tensordict = tensordict.clone(False)
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
-        log_weight, dist, _, log_is_weight = self._log_weight(
-            tensordict, adv_shape=cost_advantage.shape[:-1]
-        )
-        if log_is_weight is not None:
-            log_weight = log_weight + log_is_weight
-        kl = divergence(dist, self._improved_policy(tensordict)).unsqueeze(-1)
+        improved = self._improved_policy(tensordict)
+        policy = self.evaluate(tensordict)
+        kl = divergence(policy.distribution, improved).unsqueeze(-1)
         objective = projection_objective(
-            kl, log_weight.exp(), cost_advantage, self.lagrange_multiplier, self._cost_scale()
+            kl, policy.ratio(), cost_advantage, self.lagrange_multiplier, self._cost_scale()
         )
-        losses = TensorDict(
-            loss_projection=self._reduce_loss(objective, tensordict).squeeze(-1),
-            kl=self._reduce_loss(kl.detach(), tensordict, reduction="mean"),
+        return TensorDict(
+            loss_projection=reduced(self, objective, tensordict).squeeze(-1),
+            kl=reduced(self, kl.detach(), tensordict, reduction="mean"),
         )
-        self._clear_weakrefs(tensordict, losses, "actor_network_params", "improved_actor_params")
-        return losses
 
     @torch.no_grad()
     def _improved_policy(self, tensordict: TensorDictBase) -> torch.distributions.Distribution:

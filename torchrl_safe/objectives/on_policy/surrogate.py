@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import abc
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives.violation import (
-    ViolationMixin,
-    check_episode_length,
-    check_length_known,
-)
+from torchrl_safe.objectives._checks import check_episode_length, check_length_known
+from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO, Policy
 
 
 def clipped_cost_surrogate(
@@ -48,8 +44,11 @@ def clipped_cost_surrogate(
     return torch.as_tensor(log_is_weight).exp() * (products - cost_advantage)
 
 
-class CostSurrogateMixin(ViolationMixin):
-    """Adds ``loss_penalty``, a function of the mean cost surrogates, to ``ClipPPOLoss``."""
+class CostSurrogate(ConstrainedPPO):
+    """Brings the mean surrogates of the costs to a loss that penalizes them."""
+
+    cost_buffers = ("cost_violation",)
+    policy_out_keys = ("loss_penalty",)
 
     def __init__(self, *args: Any, episode_length: float | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -59,35 +58,21 @@ class CostSurrogateMixin(ViolationMixin):
                 "reduction must be 'mean', since the penalty is a function of the batch mean, got "
                 f"{self.reduction!r}."
             )
-        self._log_ratios: Any = None
+        self._asymmetric = isinstance(kwargs.get("clip_epsilon"), tuple | list)
+
+    def cost_surrogate(
+        self, tensordict: TensorDictBase, policy: Policy, cost_advantage: Tensor
+    ) -> Tensor:
+        """Mean of :func:`clipped_cost_surrogate` for each cost, shape ``(k,)``."""
+        low = self.clip_epsilon_low if self._asymmetric else self.clip_epsilon
+        high = self.clip_epsilon_high if self._asymmetric else self.clip_epsilon
+        surrogate = clipped_cost_surrogate(
+            policy.log_ratio,
+            cost_advantage,
+            ((-low).log1p(), high.log1p()),
+            0.0 if policy.log_correction is None else policy.log_correction,
+        )
+        return torch.stack([reduced(self, column, tensordict) for column in surrogate.unbind(-1)])
 
     def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
         check_length_known(self.episode_length, estimator.gamma)
-
-    @abc.abstractmethod
-    def _penalty(self, surrogate: Tensor) -> Tensor:
-        """The penalty of each cost, shape ``(k,)``, from its mean surrogate, shape ``(k,)``."""
-
-    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
-        # Kept for the penalty, so that the policy is evaluated once.
-        evaluated = super()._log_weight(tensordict, adv_shape)
-        self._log_ratios = evaluated[0], evaluated[3]
-        return evaluated
-
-    def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
-        log_weight, log_is_weight = self._log_ratios
-        self._log_ratios = None
-        cost_advantage = tensordict.get(self.tensor_keys.cost_advantage)
-        self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
-        surrogate = clipped_cost_surrogate(
-            log_weight,
-            cost_advantage,
-            self._clip_bounds,
-            0.0 if log_is_weight is None else log_is_weight,
-        )
-        means = [self._reduce_loss(column, tensordict) for column in surrogate.unbind(-1)]
-        losses.set("loss_penalty", self._penalty(torch.stack(means)).sum())
-        super()._set_cost_outputs(losses, tensordict)
-
-    def _cost_out_keys(self) -> list[NestedKey]:
-        return ["loss_penalty", *super()._cost_out_keys()]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,14 +11,14 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._actor import divergence
 from torchrl_safe.objectives._checks import as_number, check_number
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
+from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
+from torchrl_safe.objectives.on_policy.policies import divergence
 
 
-class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
+class FOCOPSLoss(ConstrainedPPO, PPOLoss):
     r"""Projects the best policy of a trust region on the policies of the network.
 
     Presented in "First Order Constrained Optimization in Policy Space", Zhang, Vuong, Ross 2020
@@ -76,51 +75,22 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
         >>> from torchrl_safe.objectives import DualAscent
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
-        >>> loss = FOCOPSLoss(actor, critic, cost_critic, num_costs=2)
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> loss = FOCOPSLoss(*make_networks(num_costs=2), num_costs=2)
         >>> updater = DualAscent(loss, cost_limit=torch.tensor([1.0, 5.0]), lr=0.01)
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> batch = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     batch = actor(batch)
-        >>> batch["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 2),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
-        >>> losses = loss(loss.estimate_advantages(batch).reshape(-1))
-        >>> losses["lagrange_multiplier_0"], losses["kl"]
-        (tensor(0.0200), tensor(0.))
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))  # a row for each episode
+        >>> losses = loss(loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1))
+        >>> losses["lagrange_multiplier_0"], losses["kl"] > 0
+        (tensor(0.0200), tensor(True))
     """
 
     _schedulable_buffers = frozenset({"temperature", "kl_bound"})
 
+    policy_out_keys = ("loss_kl", "kl")
+
     temperature: Tensor
     kl_bound: Tensor
-
-    @dataclass
-    class _AcceptedKeys(CostKeys, PPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,
@@ -138,7 +108,7 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
         super().__init__(
             actor_network,
             critic_network,
-            cost_critic_network=cost_critic_network,
+            cost_critic_network,
             num_costs=num_costs,
             multiplier_init=multiplier_init,
             cost_critic_coeff=cost_critic_coeff,
@@ -150,38 +120,34 @@ class FOCOPSLoss(MixedAdvantageMixin, PPOLoss):
         device = self.cost_critic_coeff.device
         self.register_coeff_buffer("temperature", temperature, device=device)
         self.register_coeff_buffer("kl_bound", float(kl_bound), device=device)
-        self._kl: Any = None
 
-    def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:
-        multiplier = self.lagrange_multiplier
-        mixed = penalized_advantage(advantage, cost_advantage, multiplier, rescale=False)
-        return mixed / self.temperature
-
-    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
-        # Read before the policy is evaluated, which may write parameters of its own.
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        # pi_theta_k, read before the policy is evaluated, which writes parameters of its own.
         old = self.actor_network.build_dist_from_params(
             tensordict.select(*self._distribution_keys())
         )
-        log_weight, dist, *others = super()._log_weight(tensordict, adv_shape)
-        kl = divergence(dist, old).unsqueeze(-1)
-        # Kept for the other term, so that the policy is evaluated once.
-        self._kl = kl
+        policy = self.evaluate(tensordict)
+        # D_KL(pi_theta || pi_theta_k)
+        kl = divergence(policy.distribution, old).unsqueeze(-1)
+        far = kl > self.kl_bound
+        # A_r - sum_i nu_i A_ci
+        gain = penalized_advantage(
+            advantage, cost_advantage, self.lagrange_multiplier, rescale=False
+        )
         # A ratio of zero leaves a state out of the objective and of its gradient.
-        return log_weight.masked_fill(kl > self.kl_bound, -torch.inf), dist, *others
+        near = policy._replace(log_ratio=policy.log_ratio.masked_fill(far, -torch.inf))
+        losses = self.unconstrained(tensordict, gain / self.temperature, near)
+        near_kl = reduced(self, kl.masked_fill(far, 0.0), tensordict)
+        losses.set("loss_kl", near_kl.squeeze(-1))
+        losses.set("kl", reduced(self, kl.detach(), tensordict, reduction="mean"))
+        return losses
 
     def _distribution_keys(self) -> list[NestedKey]:
         return self.actor_network[-1].in_keys
 
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        self._in_keys += [key for key in self._distribution_keys() if key not in self._in_keys]
-
-    def _set_cost_outputs(self, losses: TensorDictBase, tensordict: TensorDictBase) -> None:
-        kl, self._kl = self._kl, None
-        near = kl.masked_fill(kl > self.kl_bound, 0.0)
-        losses.set("loss_kl", self._reduce_loss(near, tensordict).squeeze(-1))
-        losses.set("kl", self._reduce_loss(kl.detach(), tensordict, reduction="mean"))
-        super()._set_cost_outputs(losses, tensordict)
-
-    def _cost_out_keys(self) -> list[NestedKey]:
-        return ["loss_kl", "kl", *super()._cost_out_keys()]
+    def _list_in_keys(self) -> None:
+        super()._list_in_keys()
+        keys = [*self.in_keys, *self._distribution_keys()]
+        self.in_keys = list(dict.fromkeys(keys))

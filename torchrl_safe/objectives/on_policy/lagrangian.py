@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._lagrange import LagrangeMultiplierMixin
-from torchrl_safe.objectives._wrapped import WrappedLoss
 from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedLoss
+from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
 
 
-class LagrangianLoss(LagrangeMultiplierMixin, WrappedLoss):
+class LagrangianLoss(ConstrainedLoss, WrappedLoss):
     r"""Puts an advantage loss under constraints on k expected costs.
 
     The wrapped loss is left as it is; it is given the advantage of
@@ -66,50 +64,20 @@ class LagrangianLoss(LagrangeMultiplierMixin, WrappedLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
         >>> from torchrl.objectives import A2CLoss
         >>> from torchrl_safe.objectives import DualAscent
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=TanhNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> actor, critic, cost_critic = make_networks(num_costs=2)
         >>> a2c = A2CLoss(actor, critic, entropy_bonus=False)
         >>> loss = LagrangianLoss(a2c, cost_critic, num_costs=2)
         >>> updater = DualAscent(loss, cost_limit=1.0, lr=0.5)
-        >>> updater.step(torch.tensor([[3.0, 0.0]]))
+        >>> updater.step(torch.tensor([[3.0, 0.0]]))  # a row for each episode
         >>> loss.lagrange_multiplier
         tensor([1., 0.])
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> data = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     data = actor(data)
-        >>> data["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 2),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> losses = loss(loss.estimate_advantages(data).reshape(-1))
+        >>> losses = loss(loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1))
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
         ['loss_cost_critic', 'loss_critic', 'loss_objective']
     """
-
-    @dataclass
-    class _AcceptedKeys(CostKeys):
-        pass
-
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,
@@ -130,5 +98,8 @@ class LagrangianLoss(LagrangeMultiplierMixin, WrappedLoss):
             separate_losses=separate_losses,
         )
 
-    def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:
-        return penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+        return self.unconstrained(tensordict, mixed)

@@ -11,12 +11,12 @@ from torchrl.objectives import LossModule
 from torchrl.trainers.algorithms import PPOTrainer
 
 from torchrl_safe.objectives import CUPLoss, TrustRegionLoss
-from torchrl_safe.objectives._cost_critic import CostCriticMixin
-from torchrl_safe.objectives._cost_updater import CostUpdater
+from torchrl_safe.objectives.critics.cost_critic import CostCritic
+from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 from torchrl_safe.trainers.multiplier_hook import MultiplierHook
 
 
-class PPOLagrangianTrainer(PPOTrainer):
+class ConstrainedPPOTrainer(PPOTrainer):
     """TorchRL's PPO trainer for a loss with costs and a rule that moves its multipliers.
 
     It is :class:`~torchrl.trainers.algorithms.PPOTrainer` with a :class:`MultiplierHook` and with
@@ -80,7 +80,7 @@ class PPOLagrangianTrainer(PPOTrainer):
         >>> critic = ValueOperator(torch.nn.Linear(40, 1), ["observation"])
         >>> cost_critic = ValueOperator(torch.nn.Linear(40, 1), ["observation"], ["cost_value"])
         >>> loss = PPOLagrangianLoss(actor, critic, cost_critic, entropy_bonus=False)
-        >>> trainer = PPOLagrangianTrainer(
+        >>> trainer = ConstrainedPPOTrainer(
         ...     collector=Collector(
         ...         env, actor, frames_per_batch=40, auto_register_policy_transforms=False
         ...     ),
@@ -101,7 +101,7 @@ class PPOLagrangianTrainer(PPOTrainer):
         80
     """
 
-    _algo_name = "PPO-Lagrangian"
+    _algo_name = "constrained PPO"
 
     def __init__(
         self,
@@ -142,7 +142,7 @@ class PPOLagrangianTrainer(PPOTrainer):
 
 
 def _check_loss(loss_module: LossModule) -> None:
-    if not isinstance(loss_module, CostCriticMixin):
+    if not isinstance(loss_module, CostCritic):
         raise TypeError(
             "loss_module must be an on-policy loss with a cost critic, such as PPOLagrangianLoss, "
             f"got {type(loss_module).__name__}."

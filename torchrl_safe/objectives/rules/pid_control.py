@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives._checks import as_number, check_number
-from torchrl_safe.objectives.multipliers import MultiplierUpdater
+from torchrl_safe.objectives.rules.multipliers import MultiplierUpdater
 
 
 class PIDControl(MultiplierUpdater):

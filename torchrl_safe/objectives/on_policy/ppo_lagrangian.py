@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
+from torchrl_safe.objectives.functional import penalized_advantage
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 
 
-class PPOLagrangianLoss(MixedAdvantageMixin, ClipPPOLoss):
+class PPOLagrangianLoss(ConstrainedPPO, ClipPPOLoss):
     r"""Clipped PPO loss under constraints on k expected costs.
 
     Presented in "Benchmarking Safe Exploration in Deep Reinforcement Learning", Ray, Achiam,
@@ -61,61 +58,21 @@ class PPOLagrangianLoss(MixedAdvantageMixin, ClipPPOLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=TanhNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
+        >>> from torchrl_safe.objectives import DualAscent
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> actor, critic, cost_critic = make_networks(num_costs=2)
         >>> loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=2, entropy_bonus=False)
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> data = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     data = actor(data)
-        >>> data["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 2),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> losses = loss(loss.estimate_advantages(data).reshape(-1))
+        >>> updater = DualAscent(loss, cost_limit=torch.tensor([1.0, 5.0]), lr=0.01)
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))  # a row for each episode
+        >>> losses = loss(loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1))
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
         ['loss_cost_critic', 'loss_critic', 'loss_objective']
+        >>> losses["lagrange_multiplier_0"]
+        tensor(0.0200)
     """
 
-    @dataclass
-    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
-        cost_critic_network: TensorDictModuleBase,
-        *,
-        num_costs: int = 1,
-        multiplier_init: float | Tensor = 0.0,
-        cost_critic_coeff: float = 1.0,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            actor_network,
-            critic_network,
-            cost_critic_network=cost_critic_network,
-            num_costs=num_costs,
-            multiplier_init=multiplier_init,
-            cost_critic_coeff=cost_critic_coeff,
-            **kwargs,
-        )
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+        return self.unconstrained(tensordict, mixed)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._wrapped import WrappedLoss
-from torchrl_safe.objectives.violation import ViolationMixin
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedLoss
+from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
 
 
 def rectified_advantage(
@@ -65,7 +63,7 @@ def rectified_advantage(
     return torch.where(violation.max() > tolerance, -worst, advantage)
 
 
-class CRPOLoss(ViolationMixin, WrappedLoss):
+class CRPOLoss(ConstrainedLoss, WrappedLoss):
     r"""Gives an advantage loss the reward, or the cost whose limit is exceeded most.
 
     Presented in "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
@@ -110,51 +108,23 @@ class CRPOLoss(ViolationMixin, WrappedLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
         >>> from torchrl.objectives import ClipPPOLoss
         >>> from torchrl_safe.objectives import ViolationUpdater
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> actor, critic, cost_critic = make_networks(num_costs=2)
         >>> loss = CRPOLoss(ClipPPOLoss(actor, critic), cost_critic, num_costs=2)
         >>> updater = ViolationUpdater(loss, cost_limit=torch.tensor([1.0, 5.0]))
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> batch = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     batch = actor(batch)
-        >>> batch["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 2),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
-        >>> losses = loss(loss.estimate_advantages(batch).reshape(-1))
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))  # a row for each episode
+        >>> losses = loss(loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1))
         >>> losses["cost_violation_0"], losses["cost_violation_1"]
         (tensor(2.), tensor(-4.5000))
     """
 
     _schedulable_buffers = frozenset({"tolerance"})
 
+    cost_buffers = ("cost_violation",)
+
     tolerance: Tensor
-
-    @dataclass
-    class _AcceptedKeys(CostKeys):
-        pass
-
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,
@@ -176,5 +146,10 @@ class CRPOLoss(ViolationMixin, WrappedLoss):
         tolerance = check_number("tolerance", tolerance)
         self.register_coeff_buffer("tolerance", tolerance, device=self.cost_critic_coeff.device)
 
-    def _mix(self, advantage: Tensor, cost_advantage: Tensor) -> Tensor:
-        return rectified_advantage(advantage, cost_advantage, self.cost_violation, self.tolerance)
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        rectified = rectified_advantage(
+            advantage, cost_advantage, self.cost_violation, self.tolerance
+        )
+        return self.unconstrained(tensordict, rectified)

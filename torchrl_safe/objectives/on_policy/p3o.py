@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._cost_critic import CostKeys
-from torchrl_safe.objectives._surrogate import CostSurrogateMixin
-from torchrl_safe.objectives.violation import per_step
+from torchrl_safe.objectives.functional import per_step
+from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
 def exact_penalty(
@@ -39,7 +38,7 @@ def exact_penalty(
     return coeff * (surrogate + scale * violation).relu()
 
 
-class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
+class P3OLoss(CostSurrogate, ClipPPOLoss):
     r"""Clipped PPO loss with an exact penalty on k expected costs.
 
     Presented in "Penalized Proximal Policy Optimization for Safe Reinforcement Learning", Zhang
@@ -93,37 +92,12 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
         >>> from torchrl_safe.objectives import ViolationUpdater
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
-        >>> cost_critic = ValueOperator(
-        ...     torch.nn.Linear(4, 2), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
-        >>> loss = P3OLoss(actor, critic, cost_critic, num_costs=2)
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> loss = P3OLoss(*make_networks(num_costs=2), num_costs=2)
         >>> updater = ViolationUpdater(loss, cost_limit=torch.tensor([1.0, 5.0]))
-        >>> done = torch.zeros(3, 5, 1, dtype=torch.bool)
-        >>> batch = TensorDict(observation=torch.randn(3, 5, 4), batch_size=[3, 5])
-        >>> with torch.no_grad():
-        ...     batch = actor(batch)
-        >>> batch["next"] = TensorDict(
-        ...     observation=torch.randn(3, 5, 4),
-        ...     reward=torch.randn(3, 5, 1),
-        ...     cost=torch.rand(3, 5, 2),
-        ...     done=done,
-        ...     terminated=done,
-        ...     batch_size=[3, 5],
-        ... )
-        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))
-        >>> losses = loss(loss.estimate_advantages(batch).reshape(-1))
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))  # a row for each episode
+        >>> losses = loss(loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1))
         >>> losses["cost_violation_0"], losses["loss_penalty"] > 0
         (tensor(2.), tensor(True))
     """
@@ -131,12 +105,6 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
     _schedulable_buffers = frozenset({"penalty_coeff"})
 
     penalty_coeff: Tensor
-
-    @dataclass
-    class _AcceptedKeys(CostKeys, ClipPPOLoss._AcceptedKeys):
-        pass
-
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,
@@ -153,7 +121,7 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
         super().__init__(
             actor_network,
             critic_network,
-            cost_critic_network=cost_critic_network,
+            cost_critic_network,
             num_costs=num_costs,
             episode_length=episode_length,
             cost_critic_coeff=cost_critic_coeff,
@@ -163,6 +131,17 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
         device = self.cost_critic_coeff.device
         self.register_coeff_buffer("penalty_coeff", penalty_coeff, device=device)
 
-    def _penalty(self, surrogate: Tensor) -> Tensor:
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        policy = self.evaluate(tensordict)
+        # PPO's own losses, for the reward.
+        losses = self.unconstrained(tensordict, advantage, policy)
+        # E[max(r A_c, clip(r) A_c) - A_c]
+        surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
+        # 1 - gamma
         scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
-        return exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)
+        # kappa max(0, surrogate + (1 - gamma) (J_c - d))
+        penalty = exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)
+        losses.set("loss_penalty", penalty.sum())
+        return losses

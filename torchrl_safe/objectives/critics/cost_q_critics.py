@@ -10,22 +10,21 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
-from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
+from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
-from torchrl_safe.objectives._cost_critic import (
-    build_value_estimators,
+from torchrl_safe.objectives.critics.cost_td0 import CostTD0
+from torchrl_safe.objectives.critics.cost_values import (
+    CostValues,
     get_or_raise,
+    initial_multiplier,
     report_each,
 )
-from torchrl_safe.objectives._lagrange import initial_multiplier
-from torchrl_safe.objectives.cost_td0 import CostTD0
 from torchrl_safe.objectives.functional import penalized_advantage
 
 
-class CostCriticsMixin(LossModule):
+class CostCriticsMixin(CostValues):
     """Adds an ensemble of critics of k costs, and their multipliers, to a loss with Q-values.
 
     To be mixed into TorchRL's :class:`~torchrl.objectives.SACLoss` or
@@ -47,8 +46,7 @@ class CostCriticsMixin(LossModule):
     lagrange_multiplier: Tensor
     reduction: str
     deactivate_vmap: bool
-    out_keys: list[NestedKey]
-    _in_keys: list[NestedKey]
+    use_prioritized_weights: str | bool
 
     def __init__(
         self,
@@ -69,9 +67,9 @@ class CostCriticsMixin(LossModule):
                 f"cost_qvalue_network must be one network or num_cost_qvalue_nets = "
                 f"{num_cost_qvalue_nets} of them, got {len(networks)}."
             )
-        # The parent's constructor already asks for in_keys, before a module can be assigned.
+        # The parent's constructor already sets keys, before a module can be assigned.
         self._cost_qvalue_in_keys = list((networks or [cost_qvalue_network])[0].in_keys)
-        self._cost_value_estimator: ValueEstimatorBase | None = None
+        self.num_costs = num_costs
         super().__init__(actor_network, qvalue_network, **kwargs)
         self.convert_to_functional(
             networks or cost_qvalue_network,
@@ -85,69 +83,56 @@ class CostCriticsMixin(LossModule):
         self.num_cost_qvalue_nets = num_cost_qvalue_nets
         device = next(self.parameters()).device
         self.register_buffer("lagrange_multiplier", multiplier.to(device))
-        self.out_keys = [
-            *self.out_keys,
-            "loss_cost_qvalue",
-            *(f"lagrange_multiplier_{index}" for index in range(num_costs)),
-        ]
-        self.register_state_dict_pre_hook(build_value_estimators)
-        self.register_load_state_dict_pre_hook(build_value_estimators)
+        self._list_in_keys()
 
-    def make_cost_value_estimator(
-        self, estimator: ValueEstimatorBase | None = None, **hyperparams: Any
-    ) -> CostCriticsMixin:
-        """Chooses how the cost critics' targets are made.
+    def _default_cost_estimator(self, **hyperparams: Any) -> ValueEstimatorBase:
+        device = self.lagrange_multiplier.device
+        return CostTD0(**{"gamma": 0.99, "device": device, **hyperparams})
 
-        Args:
-            estimator (ValueEstimatorBase, optional): an estimator that handles k columns.
-                Defaults to a :class:`~torchrl_safe.objectives.CostTD0`.
-            **hyperparams: arguments of ``CostTD0``, for example ``gamma`` (default ``0.99``).
-                They act on the costs alone; the reward's are those of ``make_value_estimator``.
+    def _cost_estimator_keys(self) -> dict[str, NestedKey]:
+        return {
+            "value": self.tensor_keys.state_action_cost_value,
+            "reward": self.tensor_keys.cost,
+            "done": self.tensor_keys.done,
+            "terminated": self.tensor_keys.terminated,
+        }
 
-        Returns:
-            The loss itself.
+    def _ensemble(
+        self,
+        network: TensorDictModule,
+        inputs: TensorDictBase,
+        params: TensorDictParams,
+        copies: int | None = None,
+    ) -> TensorDictBase:
+        """What the N critics of an ensemble write, shape ``(N, *B)``.
 
-        Raises:
-            TypeError: if ``estimator`` is no estimator.
-            ValueError: if both an estimator and hyperparameters are given.
+        With ``copies`` each has an input of its own. It is the same, but not its rounding.
         """
-        if not isinstance(estimator, ValueEstimatorBase | None):
-            raise TypeError(f"estimator must be a ValueEstimatorBase, got {estimator!r}.")
-        if estimator is None:
-            device = self.lagrange_multiplier.device
-            estimator = CostTD0(**{"gamma": 0.99, "device": device, **hyperparams})
-        elif hyperparams:
-            raise ValueError(
-                f"Pass an estimator or hyperparameters, not both: got {estimator} and "
-                f"{sorted(hyperparams)}."
-            )
-        self._cost_value_estimator = estimator
-        self._forward_value_estimator_keys()
-        return self
 
-    @property
-    def cost_value_estimator(self) -> ValueEstimatorBase:
-        """The value estimator of the costs."""
-        if self._cost_value_estimator is None:
-            self.make_cost_value_estimator()
-        return self._cost_value_estimator
+        def evaluate(data: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
+            with params.to_module(network, preserve_module_state=False):
+                return network(data)
 
-    @property
-    @_cache_values
-    def _cached_detached_cost_qvalue_params(self) -> TensorDictParams:
-        return self.cost_qvalue_network_params.detach()
+        if self.deactivate_vmap:
+            return torch.stack([evaluate(inputs.copy(), each) for each in params.unbind(0)])
+        if copies is not None:
+            inputs = inputs.expand(copies, *inputs.batch_size)
+        dims = (None if copies is None else 0, 0)
+        return torch.vmap(evaluate, dims, randomness=self.vmap_randomness)(inputs, params)
+
+    def _reduced(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Mean, sum or each, over the steps that count, by their weight in the buffer."""
+        weights = None
+        if self.use_prioritized_weights in (True, "auto"):
+            weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        # TorchRL's, for its weighted means; no public function has them.
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
 
     def _cost_qvalue(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
         """Values of the N critics for the k costs, shape ``(N, *B, k)``."""
-        ensemble = _vmap_func(
-            self.cost_qvalue_network,
-            (None, 0),
-            randomness=self.vmap_randomness,
-            pseudo_vmap=self.deactivate_vmap,
-        )
         inputs = tensordict.select(*self._cost_qvalue_in_keys, strict=False)
         key = self.tensor_keys.state_action_cost_value
-        value = ensemble(inputs, params).get(key, None)
+        value = self._ensemble(self.cost_qvalue_network, inputs, params).get(key, None)
         if value is None:
             raise KeyError(f"cost_qvalue_network does not write the key {key!r}.")
         expected = (*tensordict.batch_size, len(self.lagrange_multiplier))
@@ -169,7 +154,7 @@ class CostCriticsMixin(LossModule):
             :func:`~torchrl_safe.objectives.penalized_advantage` of the objective and the largest
             predictions for each cost, shape ``(*B,)``. The critics get no gradient.
         """
-        cost = self._cost_qvalue(tensordict, self._cached_detached_cost_qvalue_params).max(0)[0]
+        cost = self._cost_qvalue(tensordict, self.cost_qvalue_network_params.detach()).max(0)[0]
         mixed = penalized_advantage(objective.unsqueeze(-1), cost, self.lagrange_multiplier)
         return mixed.squeeze(-1)
 
@@ -194,8 +179,7 @@ class CostCriticsMixin(LossModule):
         loss = distance_loss(value, target.expand_as(value), loss_function=self.loss_function)
         # Summed, not averaged: each critic column then learns as fast with k costs as with one.
         loss = loss.sum(-1).sum(0)
-        weights = self._maybe_get_priority_weight(tensordict)
-        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+        return self._reduced(loss, tensordict)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -207,43 +191,27 @@ class CostCriticsMixin(LossModule):
                 f"{cost_key!r} must have shape {expected}, one column for each cost, got "
                 f"{tuple(cost.shape)}."
             )
-        # The parent leaves the next action in the clone; the priority belongs to the caller.
+        # value_loss leaves the next action in the clone; the priority belongs to the caller.
         data = tensordict.clone(False)
-        losses = super().forward(data)
+        losses = self.parent_forward(self, data)
         tensordict.set(self.tensor_keys.priority, data.get(self.tensor_keys.priority))
         losses.set("loss_cost_qvalue", self.cost_qvalue_loss(data))
         self._report_multipliers(losses)
-        self._clear_weakrefs(
-            tensordict,
-            data,
-            losses,
-            "cost_qvalue_network_params",
-            "target_cost_qvalue_network_params",
-        )
         return losses
 
     def _report_multipliers(self, losses: TensorDictBase) -> None:
         report_each(losses, "lagrange_multiplier", self.lagrange_multiplier)
 
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
+    def _own_out_keys(self) -> list[NestedKey]:
+        return ["loss_cost_qvalue", *(f"lagrange_multiplier_{i}" for i in range(self.num_costs))]
+
+    def _own_in_keys(self) -> list[NestedKey]:
         keys = self._cost_qvalue_in_keys
         actions = self.tensor_keys.action
         actions = [_as_tuple(key) for key in (actions if isinstance(actions, list) else [actions])]
         observed = [key for key in keys if not any(_as_tuple(key)[: len(a)] == a for a in actions)]
         following = [unravel_key(("next", key)) for key in observed]
-        keys = [*keys, *following, unravel_key(("next", self.tensor_keys.cost))]
-        self._in_keys += [key for key in dict.fromkeys(keys) if key not in self._in_keys]
-
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        super()._forward_value_estimator_keys(**kwargs)
-        if self._cost_value_estimator is not None:
-            self._cost_value_estimator.set_keys(
-                value=self.tensor_keys.state_action_cost_value,
-                reward=self.tensor_keys.cost,
-                done=self.tensor_keys.done,
-                terminated=self.tensor_keys.terminated,
-            )
+        return [*keys, *following, unravel_key(("next", self.tensor_keys.cost))]
 
 
 def _as_list(

@@ -78,6 +78,7 @@ class CostTD0(TD0Estimator):
     ) -> Tensor:
         keys = self.tensor_keys
         if next_value is None:
+            # Of the base: what the value network says of the next step.
             next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
         cost = tensordict.get(unravel_key(("next", keys.reward)))
         if cost.shape != next_value.shape:

@@ -13,7 +13,7 @@ from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives._checks import as_number, check_number
-from torchrl_safe.objectives._cost_updater import CostUpdater
+from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
 
 class MultiplierUpdater(CostUpdater):
