@@ -23,7 +23,7 @@ _HAS_MODES = Version(gymnasium.__version__) >= Version("1.1")
 _LAST_OBSERVATION = "final_obs" if _HAS_MODES else "final_observation"
 
 
-def resets_itself(env: VectorEnv) -> bool:
+def resets_itself(env: Any) -> bool:
     """Whether an environment resets in the step that ends an episode."""
     return not _HAS_MODES or env.autoreset_mode == gymnasium.vector.AutoresetMode.SAME_STEP
 
