@@ -23,8 +23,8 @@ from torchrl_safe.envs import (
     Region,
     Scene,
 )
-from torchrl_safe.envs.batch import parts, split
-from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.physics.bullet.simulator import parts, split
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.rotations import rotation_vector
 
 # What the motors have done of the way after 12 substeps, each of which does a twelfth of the rest.

@@ -21,7 +21,7 @@ from torchrl_safe.envs import (
     Reach,
     Scene,
 )
-from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
 
 

@@ -22,7 +22,7 @@ from torchrl_safe.envs import (
     Placement,
     Region,
 )
-from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.scene import Scene
 
 

@@ -130,6 +130,6 @@ def test_three_files_talk_to_pybullet():
     users = {
         path.name
         for path in sources
-        if "torchrl_safe.envs._pybullet.pybullet" in set(imported_modules(path))
+        if "torchrl_safe.envs.physics.bullet.engine.pybullet" in set(imported_modules(path))
     }
-    assert users == {"bullet.py", "bodies.py", "sensors.py"}
+    assert users == {"world.py", "bodies.py", "readings.py"}

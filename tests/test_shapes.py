@@ -15,7 +15,7 @@ from torchrl_safe.envs import (
     Region,
     Sphere,
 )
-from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.scene import Scene
 from torchrl_safe.envs.shapes import footprint
 

@@ -7,8 +7,8 @@ import pybullet_data
 import pytest
 
 from torchrl_safe.envs import PANDA, ArmModel, Gripper, Placement, Scene
-from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.gym import ARMS
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
 
 

@@ -16,7 +16,6 @@ from torchrl_safe.envs.arms import (
     ArmModel,
     Gripper,
 )
-from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.costs import (
     Collision,
     ContactForce,
@@ -37,6 +36,7 @@ from torchrl_safe.envs.moving import Motion, Moving, Patrol, Swing
 from torchrl_safe.envs.observations import FullObservation, paper_observation
 from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placement, Scattered
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS, paper_env
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.saute import Saute
 from torchrl_safe.envs.scene import Camera, Scene

@@ -9,9 +9,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.checks import check_array, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
 from torchrl_safe.envs.state import ArmState, Array
 

@@ -21,13 +21,13 @@ from torchrl.envs import EnvBase
 from torchrl_safe._checks import check_count
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta
 from torchrl_safe.envs.arms import PANDA, ArmModel
-from torchrl_safe.envs.batch import WorldBatch
-from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.observations import FullObservation
 from torchrl_safe.envs.obstacles import InFront, Obstacles
-from torchrl_safe.envs.record import EpisodeRecord, pack, unpack
+from torchrl_safe.envs.physics.bullet.record import EpisodeRecord, pack, unpack
+from torchrl_safe.envs.physics.bullet.simulator import WorldBatch
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.starts import Starts
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Sensor

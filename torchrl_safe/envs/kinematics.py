@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.checks import check_positive
+from torchrl_safe.envs.physics.bullet.world import World
 from torchrl_safe.envs.rotations import rotation_vector
 from torchrl_safe.envs.state import ArmState, Array
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from torchrl_safe.envs._pybullet import pybullet_data
 from torchrl_safe.envs.arms import ArmModel, Gripper
+from torchrl_safe.envs.physics.bullet.engine import pybullet_data
 from torchrl_safe.envs.urdf_merge import merge_fixed_links
 
 _PACKAGE = "package://"

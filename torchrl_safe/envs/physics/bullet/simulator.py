@@ -9,10 +9,10 @@ from itertools import accumulate
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.bullet import TOOL_MOTION, World
 from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe.envs.physics.bullet.readings import Vector, velocity_at
+from torchrl_safe.envs.physics.bullet.world import TOOL_MOTION, World
 from torchrl_safe.envs.scene import Camera, Scene
-from torchrl_safe.envs.sensors import Vector, velocity_at
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 

@@ -12,19 +12,19 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs._pybullet import pybullet
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.bodies import (
+from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe.envs.physics.bullet.bodies import (
     add_marker,
     add_shape,
     load_arm,
     load_body,
     load_furniture,
 )
-from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe.envs.physics.bullet.engine import pybullet
+from torchrl_safe.envs.physics.bullet.readings import MovingBody, Sensors, Vector, link_state
 from torchrl_safe.envs.rotations import UPRIGHT, rotation_vector
 from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
-from torchrl_safe.envs.sensors import MovingBody, Sensors, Vector, link_state
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import Array, Sensing
 

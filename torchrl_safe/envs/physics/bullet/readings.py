@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
-from torchrl_safe.envs._pybullet import pybullet
-from torchrl_safe.envs.bodies import LoadedArm
+from torchrl_safe.envs.physics.bullet.bodies import LoadedArm
+from torchrl_safe.envs.physics.bullet.engine import pybullet
 from torchrl_safe.envs.state import Array, Sensing
 
 Vector = Sequence[float]

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_safe.envs._pybullet import pybullet, pybullet_data
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.physics.bullet.engine import pybullet, pybullet_data
 from torchrl_safe.envs.scene import Scene
 from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.state import Array

@@ -1,0 +1,1 @@
+"""PyBullet: nothing outside this folder imports or names it."""
