@@ -17,6 +17,7 @@ from worlds import each_arm
 
 from torchrl_safe.envs import (
     ArmEnv,
+    Bullet,
     Camera,
     CartesianDelta,
     Collision,
@@ -29,7 +30,6 @@ from torchrl_safe.envs import (
     Push,
     Reach,
     Region,
-    Scene,
 )
 
 ACTIONS = [CartesianDelta(), JointDelta()]
@@ -284,7 +284,7 @@ def test_terminal_observation_is_true(make_env):
 
 def test_touch_in_the_middle_of_a_control_step_counts(make_env):
     """Each substep is read: a touch that is over at the end of the control step still costs."""
-    settings = {"scene": Scene(motor_gain=0.1), "seed": 0}
+    settings = {"physics": Bullet(motor_gain=0.1), "seed": 0}
     coarse = make_env(ArmEnv, **settings)
     # Of the same control rate, as far as the speed of the joints goes.
     fine = make_env(ArmEnv, frame_skip=1, **settings)
@@ -298,13 +298,13 @@ def test_touch_in_the_middle_of_a_control_step_counts(make_env):
         action = towards(coarse, aim)
         cost = step(coarse, action)["cost"].item()
         # The same motion by hand, one substep at a time.
-        joints, fingers = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._worlds)
+        joints, fingers = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._simulator)
         joints, fingers = fine._within_speed(joints, fingers)
         touches = []
         for _ in range(12):
-            fine._batch.advance(joints, fingers)
-            touches.append(fine._batch.state().contact_distance.item() <= 0)
-        fine._state = fine._batch.state()
+            fine._simulator.advance(joints, fingers)
+            touches.append(fine._simulator.state().contact_distance.item() <= 0)
+        fine._state = fine._simulator.state()
         assert cost == float(any(touches)), index
         lost += any(touches) and not touches[-1]
     assert lost > 0
@@ -419,6 +419,7 @@ def test_bad_arguments(arguments, message):
         ({"task": Reach}, "task must be an instance of Task, got <class"),
         ({"obstacles": Cylinder()}, "obstacles must be an instance of Obstacles"),
         ({"scene": None}, "scene must be an instance of Scene, got None"),
+        ({"physics": Bullet}, "physics must be an instance of Physics, got <class"),
         ({"observation": FullObservation}, "observation must be a callable object, got <class"),
         ({"observation": lambda s: s.goal}, "what observation returns must be an instance of Map"),
         ({"costs": [Collision()]}, "costs must be an instance of Mapping"),

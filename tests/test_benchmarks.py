@@ -64,7 +64,7 @@ def test_floor_moves_the_worlds_as_the_environment_did():
     torch.manual_seed(0)
     with tape.recording():
         env.rollout(5, auto_reset=False, tensordict=play(), break_when_any_done=False)
-    moved = env._batch.state().joint_position
+    moved = env._simulator.state().joint_position
     play()
     tape.play()
     np.testing.assert_array_equal([world.read()[:7] for world in env._worlds], moved)

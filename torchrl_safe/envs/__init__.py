@@ -1,6 +1,7 @@
 """Robot arms with costs as TorchRL environments, and transforms for any environment with costs.
 
-Only the arms need the ``arms`` extra (PyBullet).
+Only arms need a physics engine: ``physics=Bullet()`` the ``arms`` extra, ``physics=MuJoCo()`` the
+``mujoco`` extra.
 """
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
@@ -27,16 +28,13 @@ from torchrl_safe.envs.costs import (
 )
 from torchrl_safe.envs.early_termination import EarlyTermination
 from torchrl_safe.envs.human import Human
-from torchrl_safe.envs.kinematics import (
-    BulletInverseKinematics,
-    DampedLeastSquares,
-    InverseKinematics,
-)
+from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.moving import Motion, Moving, Patrol, Swing
 from torchrl_safe.envs.observations import FullObservation, paper_observation
 from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placement, Scattered
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS, paper_env
-from torchrl_safe.envs.physics.bullet.world import World
+from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
+from torchrl_safe.envs.physics.simulator import Physics, Simulator
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.saute import Saute
 from torchrl_safe.envs.scene import Camera, Scene
@@ -61,6 +59,7 @@ __all__ = [
     "ArmModel",
     "ArmState",
     "Box",
+    "Bullet",
     "BulletInverseKinematics",
     "Camera",
     "Capsule",
@@ -83,6 +82,7 @@ __all__ = [
     "NoObstacles",
     "Obstacles",
     "Patrol",
+    "Physics",
     "PickAndPlace",
     "Placement",
     "Proximity",
@@ -95,13 +95,13 @@ __all__ = [
     "Sensing",
     "Sensor",
     "Shape",
+    "Simulator",
     "Speed",
     "SpeedAndSeparation",
     "Sphere",
     "Swing",
     "Task",
     "Workspace",
-    "World",
     "paper_env",
     "paper_observation",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Protocol, runtime_checkable
@@ -11,7 +10,7 @@ import numpy as np
 
 from torchrl_safe.envs.checks import check_array, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
-from torchrl_safe.envs.physics.bullet.world import World
+from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
 from torchrl_safe.envs.state import ArmState, Array
 
@@ -31,9 +30,7 @@ class ActionMode(Protocol):
     def width(self, num_joints: int) -> int:
         """Returns the number of components of an action."""
 
-    def targets(
-        self, action: Array, state: ArmState, worlds: Sequence[World]
-    ) -> tuple[Array, Array]:
+    def targets(self, action: Array, state: ArmState, simulator: Simulator) -> tuple[Array, Array]:
         """Returns joint targets, rad, ``(N, n)``, and finger targets, m, ``(N, f or 0)``."""
 
 
@@ -108,14 +105,12 @@ class CartesianDelta:
         turns = 3 if self.rotation_step is not None else int(self.yaw_step is not None)
         return 3 + turns + self.moves_fingers
 
-    def targets(
-        self, action: Array, state: ArmState, worlds: Sequence[World]
-    ) -> tuple[Array, Array]:
+    def targets(self, action: Array, state: ArmState, simulator: Simulator) -> tuple[Array, Array]:
         position = state.ee_position + self.step * action[:, :3]
-        home = worlds[0].home_orientation
+        home = simulator.home_orientation
         kept = np.asarray(home if self.orientation is None else self.orientation)
         joints = self.inverse_kinematics(
-            position, self._orientation(action, state, kept), state, worlds
+            position, self._orientation(action, state, kept), state, simulator
         )
         return joints, _finger_targets(action, state, self.finger_step)
 
@@ -175,9 +170,7 @@ class JointDelta:
     def width(self, num_joints: int) -> int:
         return num_joints + self.moves_fingers
 
-    def targets(
-        self, action: Array, state: ArmState, worlds: Sequence[World]
-    ) -> tuple[Array, Array]:
+    def targets(self, action: Array, state: ArmState, simulator: Simulator) -> tuple[Array, Array]:
         joints = state.joint_position
         joints = joints + self.step * action[:, : joints.shape[1]]
         if self.respect_limits:

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from torchrl_safe.envs.checks import check_positive
-from torchrl_safe.envs.physics.bullet.world import World
+from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import rotation_vector
 from torchrl_safe.envs.state import ArmState, Array
 
@@ -20,7 +20,7 @@ class InverseKinematics(Protocol):
     """Turns tool poses into joint angles."""
 
     def __call__(
-        self, position: Array, orientation: Array, state: ArmState, worlds: Sequence[World]
+        self, position: Array, orientation: Array, state: ArmState, simulator: Simulator
     ) -> Array:
         """Returns joint angles, rad, ``(N, n)``.
 
@@ -28,7 +28,8 @@ class InverseKinematics(Protocol):
             position: wanted tool points, m, ``(N, 3)``.
             orientation: wanted tool orientations, quaternions (x, y, z, w), ``(N, 4)``.
             state: the current state.
-            worlds: the N worlds.
+            simulator: gives Jacobians, see
+                :class:`~torchrl_safe.envs.Simulator`.
         """
 
 
@@ -60,12 +61,10 @@ class DampedLeastSquares:
         check_positive(damping=self.damping)
 
     def __call__(
-        self, position: Array, orientation: Array, state: ArmState, worlds: Sequence[World]
+        self, position: Array, orientation: Array, state: ArmState, simulator: Simulator
     ) -> Array:
         angles = state.joint_position
-        jacobian = np.array(
-            [world.jacobian(row) for world, row in zip(worlds, angles.tolist(), strict=True)]
-        )
+        jacobian = simulator.jacobian(angles)
         error = np.concatenate(
             [
                 position - state.ee_position,
@@ -79,46 +78,25 @@ class DampedLeastSquares:
         return np.clip(angles + change[:, :, 0], state.joint_lower, state.joint_upper)
 
 
-@dataclass(frozen=True)
-class BulletInverseKinematics:
-    """PyBullet's own solver with its defaults: 20 iterations, no joint limits.
-
-    Only for the paper's environment: it is slower and less exact than
-    :class:`DampedLeastSquares`.
-    """
-
-    def __call__(
-        self, position: Array, orientation: Array, state: ArmState, worlds: Sequence[World]
-    ) -> Array:
-        return np.array(
-            [
-                world.inverse_kinematics(*pose)
-                for world, *pose in zip(
-                    worlds, position.tolist(), orientation.tolist(), strict=True
-                )
-            ]
-        )
-
-
-def distance_to_reach(world: World, start: Sequence[float], point: Array) -> float:
+def distance_to_reach(simulator: Simulator, start: Sequence[float], point: Array) -> float:
     """Returns how far from a point the tool stays, m, however it is turned; 0 if it gets there.
 
-    Moves the arm at once, so that the world is to be reset afterwards.
+    The worlds are to be reset afterwards.
 
     Args:
-        world: the world.
+        simulator: the worlds.
         start: joint angles to begin from, rad, ``(n,)``.
         point: where the tool is to get, m, ``(3,)``.
     """
     angles, nearest = np.array(start, dtype=float), np.inf
     for _ in range(_ITERATIONS):
-        error = point - world.tool_at(angles.tolist())[0]
+        error = point - simulator.tool_at(angles[None])[0][0]
         nearest = min(nearest, float(np.linalg.norm(error)))
         if nearest < _ARRIVED:
             return 0.0
-        jacobian = np.array(world.jacobian(angles.tolist())[:3])
+        jacobian = simulator.jacobian(angles[None])[0, :3]
         # Far away the Jacobian is no guide: steps are short.
         error *= min(1.0, _LONGEST_STEP / float(np.linalg.norm(error)))
         change = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-3 * np.eye(3), error)
-        angles = np.clip(angles + change, world.joint_lower, world.joint_upper)
+        angles = np.clip(angles + change, simulator.joint_lower, simulator.joint_upper)
     return nearest

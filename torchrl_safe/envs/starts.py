@@ -8,7 +8,7 @@ from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.kinematics import distance_to_reach
 from torchrl_safe.envs.obstacles import Obstacles, Placement
-from torchrl_safe.envs.physics.bullet.simulator import WorldBatch
+from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.state import Array
 from torchrl_safe.envs.tasks import Task
 
@@ -24,11 +24,13 @@ class Starts:
         arm: the arm.
         task: what draws goal and objects.
         obstacles: what draws where the obstacles are.
-        batch: the worlds.
+        simulator: the worlds.
     """
 
-    def __init__(self, arm: ArmModel, task: Task, obstacles: Obstacles, batch: WorldBatch) -> None:
-        self._arm, self._task, self._obstacles, self._batch = arm, task, obstacles, batch
+    def __init__(
+        self, arm: ArmModel, task: Task, obstacles: Obstacles, simulator: Simulator
+    ) -> None:
+        self._arm, self._task, self._obstacles, self._simulator = arm, task, obstacles, simulator
 
     def check(self) -> None:
         """Tries some.
@@ -44,7 +46,7 @@ class Starts:
             goal, objects = self._draw_task(generator)
             for name, points in (("goals", goal[None]), ("objects", objects)):
                 for point in points:
-                    miss = distance_to_reach(self._batch.worlds[0], self._arm.home, point)
+                    miss = distance_to_reach(self._simulator, self._arm.home, point)
                     if miss > _REACHED:
                         raise ValueError(
                             f"task must draw {name} that the arm can reach, got "
@@ -63,8 +65,8 @@ class Starts:
         goal, objects = self._draw_task(generator)
         for _ in range(_ATTEMPTS):
             placement = self._draw_obstacles(generator, goal, objects)
-            self._batch.reset(row, placement, goal, objects)
-            if (clearance := self._batch.worlds[row].clearance()) > 0:
+            self._simulator.reset(row, placement, goal, objects)
+            if (clearance := self._simulator.clearance(row)) > 0:
                 return
         raise ValueError(
             f"obstacles must leave the arm free at home and the objects where they are, got an "
@@ -79,7 +81,7 @@ class Starts:
     def _draw_obstacles(
         self, generator: np.random.Generator, goal: Array, objects: Array
     ) -> Placement:
-        start = objects[0] if len(objects) else np.array(self._batch.worlds[0].home_position)
+        start = objects[0] if len(objects) else self._simulator.home_position
         placement = self._obstacles.sample(generator, start, goal)
         check_kind("placement", placement, Placement)
         shapes = self._obstacles.shapes

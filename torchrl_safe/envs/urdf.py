@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from torchrl_safe.envs.arms import ArmModel, Gripper
-from torchrl_safe.envs.physics.bullet.engine import pybullet_data
 from torchrl_safe.envs.urdf_merge import merge_fixed_links
 
 _PACKAGE = "package://"
 # What the names of an attached gripper begin with, so that they are not those of the arm.
 _PREFIX = "gripper/"
-_MORE_ARMS = "example-robot-data"
+_DATA, _MORE_ARMS = "pybullet_data", "example-robot-data"
 
 
 class PreparedUrdf(NamedTuple):
@@ -75,6 +75,8 @@ def find_urdf(name: str) -> Path:
     hint = f"there is no such file in any of {[str(folder) for folder in _folders()]}"
     if str(name).partition("/")[0].endswith("_description"):
         hint += f'; the arms of {_MORE_ARMS} need `pip install "torchrl-safe[more-arms]"`'
+    elif importlib.util.find_spec(_DATA) is None:
+        hint += f'; the arms of {_DATA} need `pip install "torchrl-safe[arms]"`'
     raise ValueError(f"urdf must be a readable URDF file, got {name!r}: {hint}.")
 
 
@@ -92,7 +94,9 @@ def movable_chain(root: ElementTree.Element, tip: str) -> set[str]:
 
 
 def _folders() -> Iterator[Path]:
-    yield Path(pybullet_data.getDataPath())
+    data = importlib.util.find_spec(_DATA)
+    if data is not None and data.origin is not None:
+        yield Path(data.origin).parent
     try:
         package = importlib.metadata.distribution(_MORE_ARMS)
     except importlib.metadata.PackageNotFoundError:
@@ -122,7 +126,7 @@ def _read(name: str, *, visuals: bool) -> ElementTree.Element:
 
 
 def _weigh_frames(root: ElementTree.Element) -> None:
-    # A link without inertia only names a frame, but PyBullet would give it 1 kg.
+    # A link without inertia only names a frame, but an engine may give it 1 kg.
     fixed = {_end(j, "child") for j in root.findall("joint") if j.get("type") == "fixed"}
     for link in root.findall("link"):
         if link.get("name") in fixed and link.find("inertial") is None:

@@ -1,4 +1,4 @@
-"""Makes one link of those that fixed joints hold together: Bullet pays for every link."""
+"""Makes one link of those that fixed joints hold together: engines pay for every link."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def merge_fixed_links(root: Element, keep: str) -> None:
     """Merges every link that a fixed joint holds into the link that holds it.
 
     Shapes move over, masses and inertias add up: it is the same body, only cheaper to simulate.
-    (But PyBullet reads inertias only with ``Scene.urdf_inertia``; else it makes its own of the box
-    around a link's shapes, which is another one when there are more shapes.)
+    (But an engine may make its own inertia of the box around a link's shapes, which is another
+    one when there are more shapes.)
 
     Args:
         root: a URDF; changed in place.
@@ -67,7 +67,7 @@ def _add_inertia(holder: Element, held: Element, frame: Array) -> None:
 def _inertia(link: Element, frame: Array) -> tuple[float, Array, Array]:
     """Mass, kg, centre, m, and inertia about it, kg m^2, of a link as seen from a frame."""
     inertial = link.find("inertial")
-    if inertial is None:  # What PyBullet makes of it.
+    if inertial is None:  # What engines make of it.
         return 1.0, frame[:3, 3], np.eye(3)
     pose = frame @ _frame(inertial)
     mass = float(inertial.find("mass").get("value", 0))  # type: ignore[union-attr]

@@ -56,7 +56,14 @@ class LoadedArm:
 
 
 def load_arm(
-    client: int, arm: ArmModel, scene: Scene, *, visuals: bool, self_collision: bool
+    client: int,
+    arm: ArmModel,
+    scene: Scene,
+    *,
+    visuals: bool,
+    merge: bool,
+    urdf_inertia: bool,
+    self_collision: bool,
 ) -> LoadedArm:
     """Loads an arm whose fingers are fixed unless the scene leaves them free.
 
@@ -64,9 +71,9 @@ def load_arm(
         ValueError: if the URDF does not load or the home pose does not fit it.
     """
     text, chain, tool_link = prepare_urdf(
-        arm, visuals=visuals, fix_fingers=not scene.free_fingers, merge=scene.merged_links
+        arm, visuals=visuals, fix_fingers=not scene.free_fingers, merge=merge
     )
-    flags = pybullet.URDF_USE_INERTIA_FROM_FILE if scene.urdf_inertia else 0
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE if urdf_inertia else 0
     if self_collision:
         flags |= pybullet.URDF_USE_SELF_COLLISION
     with tempfile.TemporaryDirectory() as folder:
@@ -149,12 +156,14 @@ def _find_joints(client: int, body: int, chain: set[str], tool_link: str) -> Loa
     )
 
 
-def load_furniture(client: int, scene: Scene, *, visuals: bool) -> list[int]:
-    """Loads the scene's furniture, or a table whose top is at height 0."""
-    if scene.furniture:
+def load_furniture(
+    client: int, furniture: Sequence[tuple[str, Sequence[float]]], *, visuals: bool
+) -> list[int]:
+    """Loads URDF files of ``pybullet_data``, or if there are none a table with top at height 0."""
+    if furniture:
         return [
             pybullet.loadURDF(_data(urdf), position, useFixedBase=True, physicsClientId=client)
-            for urdf, position in scene.furniture
+            for urdf, position in furniture
         ]
     table = Box(half_extents=(0.75, 0.6, 0.025))
     body = add_shape(client, table, (0.5, 0, -0.025), _WOOD if visuals else None)

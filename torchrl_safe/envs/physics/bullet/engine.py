@@ -1,6 +1,6 @@
 """PyBullet where it is installed, and elsewhere what says so as soon as a world is to be made.
 
-The transforms of this package, and environments of others, need no simulator.
+The transforms of this package, other engines and environments of others need none.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ except ImportError:
 
     class _Missing:
         def __getattr__(self, name: str) -> Any:
-            raise ImportError('Robot arms need PyBullet: pip install "torchrl-safe[arms]".')
+            raise ImportError('physics=Bullet() needs PyBullet: pip install "torchrl-safe[arms]".')
 
     pybullet = pybullet_data = _Missing()
 

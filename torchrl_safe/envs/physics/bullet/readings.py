@@ -1,4 +1,4 @@
-"""Measures in one world what costs ask for; like ``bullet.py``, of which it is a part."""
+"""Measures in one world what costs ask for; like ``world.py``, of which it is a part."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class MovingBody(NamedTuple):
     angular_velocity: Vector
 
 
-class Sensors:
+class Readings:
     """What :class:`~torchrl_safe.envs.Sensing` describes, read from PyBullet.
 
     Args:
@@ -37,7 +37,7 @@ class Sensors:
         num_obstacles: number of obstacles, present or not.
         sensing: what is measured.
         fresh_links: read links where they are now. Reading one so makes Bullet forget where it
-            was one substep ago, which a scene may want to be read.
+            was one substep ago, which may be wanted.
     """
 
     def __init__(

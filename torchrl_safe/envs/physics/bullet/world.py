@@ -1,4 +1,4 @@
-"""One simulated world. With ``bodies.py`` and ``sensors.py`` all that talks to PyBullet."""
+"""One simulated world. With ``bodies.py`` and ``readings.py`` all that talks to PyBullet."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import sys
 import weakref
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,15 @@ from torchrl_safe.envs.physics.bullet.bodies import (
     load_furniture,
 )
 from torchrl_safe.envs.physics.bullet.engine import pybullet
-from torchrl_safe.envs.physics.bullet.readings import MovingBody, Sensors, Vector, link_state
-from torchrl_safe.envs.rotations import UPRIGHT, rotation_vector
-from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
+from torchrl_safe.envs.physics.bullet.readings import MovingBody, Readings, Vector, link_state
+from torchrl_safe.envs.physics.paths import look_ahead
+from torchrl_safe.envs.rotations import UPRIGHT
+from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import Array, Sensing
+
+if TYPE_CHECKING:
+    from torchrl_safe.envs.physics.bullet.physics import Bullet
 
 _RED, _YELLOW, _BLUE = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.15, 0.4, 0.8, 1.0)
 #: Centre of mass of the tool link, m, its velocity, m/s, and the link's angular velocity, rad/s.
@@ -42,7 +46,8 @@ class World:
 
     Args:
         arm: the arm.
-        scene: how the world is simulated.
+        scene: what is around it.
+        options: how the world is simulated.
         shapes: the obstacles.
         objects: what the task moves.
         sensing: what is measured in every substep.
@@ -54,7 +59,8 @@ class World:
         self,
         arm: ArmModel,
         scene: Scene,
-        shapes: Sequence[Shape],
+        options: Bullet,
+        shapes: Sequence[Shape] = (),
         objects: Sequence[Shape] = (),
         *,
         sensing: Sensing = Sensing(),
@@ -71,7 +77,7 @@ class World:
             )
         # PyBullet reuses client numbers: each is disconnected once, by its owner.
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
-        self._scene = scene
+        self._scene, self._options = scene, options
         try:
             self._build(arm, shapes, objects, sensing, visuals=visuals or gui)
         except BaseException:
@@ -99,15 +105,24 @@ class World:
         *,
         visuals: bool,
     ) -> None:
-        client, scene = self._client, self._scene
+        client, scene, options = self._client, self._scene, self._options
         pybullet.setGravity(0, 0, -scene.gravity, physicsClientId=client)
         # Contacts then do not depend on the order in which bodies came close.
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        furniture = load_furniture(client, scene, visuals=visuals)
-        self._arm = load_arm(client, arm, scene, visuals=visuals, self_collision=sensing.itself)
+        furniture = load_furniture(client, options.furniture, visuals=visuals)
+        self._arm = load_arm(
+            client,
+            arm,
+            scene,
+            visuals=visuals,
+            # What touches objects has friction and stiffness of its own, link by link.
+            merge=options.merged_links and not objects,
+            urdf_inertia=options.urdf_inertia,
+            self_collision=sensing.itself,
+        )
         self._driven = self._arm.joints + self._arm.fingers
-        self._sensors = Sensors(
-            client, self._arm, furniture, len(shapes), sensing, fresh_links=scene.fresh_links
+        self._readings = Readings(
+            client, self._arm, furniture, len(shapes), sensing, fresh_links=options.fresh_links
         )
         self._senses = sensing != Sensing()
         red, blue = (_RED, _BLUE) if visuals else (None, None)
@@ -119,8 +134,8 @@ class World:
             for index, shape in enumerate(objects)
         ]
         self._is_fixed = [shape.mass == 0 for shape in shapes]
-        brick = None if scene.target_urdf is None else load_body(client, scene.target_urdf, _LIMBO)
-        self._brick = brick
+        urdf = options.target_urdf
+        self._brick = brick = None if urdf is None else load_body(client, urdf, _LIMBO)
         self._marker = add_marker(client, _LIMBO, _YELLOW) if visuals and brick is None else None
         bodies = zip(self._obstacles, self._is_fixed, strict=True)
         self._movable = [body for body, fixed in bodies if not fixed] + self._objects
@@ -197,19 +212,9 @@ class World:
         )
 
     def _look_ahead(self, substeps: int) -> list[tuple[list[Vector], ...]]:
-        """The obstacles' ways through the next substeps.
-
-        Returns:
-            For now and after each substep the positions, orientations, velocities and angular
-            velocities of all obstacles.
-        """
-        times = SUBSTEP * np.arange(self._substeps, self._substeps + substeps + 1, dtype=float)
-        positions, orientations = self._placement.at(times)
-        velocities = np.diff(positions, axis=0) / SUBSTEP
-        spins = rotation_vector(orientations[:-1], orientations[1:]) / SUBSTEP
-        # Those of now are those of the first substep.
-        moves = [np.concatenate([part[:1], part]).tolist() for part in (velocities, spins)]
-        return list(zip(positions.tolist(), orientations.tolist(), *moves, strict=True))
+        """The obstacles' ways through the next substeps: for now, and after each of them."""
+        ways = look_ahead(self._placement, self._substeps, substeps)
+        return list(zip(*(part.tolist() for part in ways), strict=True))
 
     def _follow(
         self,
@@ -235,7 +240,7 @@ class World:
             measurements of :meth:`measure`.
         """
         client, arm = self._client, self._arm.body
-        self._command(joint_target, finger_target, self._scene.motor_gain or 1 / substeps)
+        self._command(joint_target, finger_target, self._options.motor_gain or 1 / substeps)
         distances = [math.inf] * len(self._obstacles)
         forces = [0.0] * len(self._obstacles)
         measurements = []
@@ -275,7 +280,7 @@ class World:
     def read(self, *, fresh: bool = False) -> list[float]:
         """Returns the state as one flat row, in the order of :meth:`read_shapes`."""
         positions, velocities, *_ = zip(*self._joint_states(), strict=True)
-        link = self._link_state(fresh=fresh or self._scene.fresh_links)
+        link = self._link_state(fresh=fresh or self._options.fresh_links)
         goal = self._goal if self._brick is None else self._pose(self._brick)[0]
         if self._bodies_move:
             self._bodies = self._read_bodies()
@@ -329,7 +334,7 @@ class World:
         Args:
             touches: read contact points, which are those of the last substep.
         """
-        indices = range(len(self._obstacles)) if self._sensors.sensing.clearance else ()
+        indices = range(len(self._obstacles)) if self._readings.sensing.clearance else ()
         obstacles = [
             MovingBody(
                 self._obstacles[index],
@@ -340,11 +345,11 @@ class World:
             else None
             for index in indices
         ]
-        return self._sensors.read(obstacles, touches=touches)
+        return self._readings.read(obstacles, touches=touches)
 
     def trace_shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the parts of a row that :meth:`measure` returns."""
-        return self._sensors.shapes()
+        return self._readings.shapes()
 
     def clearance(self) -> float:
         """Returns the smallest distance of obstacles from arm and objects, up to 0.1 m."""
