@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow compare paper sweep profile gallery bench ray docs lint format type clean
+.PHONY: train test test-slow compare paper sweep profile gallery bench draws ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -31,6 +31,9 @@ profile: $(READY)  ## return and cost for fixed multipliers; goes on where it wa
 
 bench: $(READY)  ## ratios against the physics floor and other libraries; wants a quiet machine
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
+
+draws: $(READY)  ## starts of every registered combination, without physics: how many find no room
+	$(BIN)/python tests/draws.py $(ARGS)
 
 ray: $(READY)  ## two costs on a Ray cluster; on this machine, or on yours with ARGS="--address auto"
 	$(BIN)/python -m experiments.ray_training $(ARGS)

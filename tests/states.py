@@ -24,6 +24,8 @@ def make_state(**changes):
         "obstacle_size": np.ones((1, 3)),
         "contact_distance": np.full((2, 1), np.inf),
         "contact_force": np.zeros((2, 1)),
+        "step": np.zeros(2, int),
+        "time": np.zeros(2),
         "trace": Trace(),
     }
     arrays = {k: v if k == "trace" else np.asarray(v) for k, v in changes.items()}

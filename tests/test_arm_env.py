@@ -8,6 +8,7 @@ import numpy as np
 import pybullet
 import pytest
 import torch
+from bullet_worlds import worlds_of
 from scripted import fly, over, straight
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
@@ -33,6 +34,7 @@ from torchrl_safe.envs import (
 )
 
 ACTIONS = [CartesianDelta(), JointDelta()]
+HOME, TINY = [0.35, 0, 0.2], Region((0.5, -0.1, 0), (0.6, 0.1, 0))
 TWO = (Cylinder(), Cylinder())
 ROLLING = InFront(shape=Cylinder(mass=1.0))
 by_name = {"ids": lambda value: type(value).__name__}
@@ -233,6 +235,38 @@ def test_partial_reset_leaves_the_other_worlds_alone(make_env):
     assert np.array_equal(alone.arm_state.goal[1], disturbed.arm_state.goal[1])
 
 
+def test_the_state_tells_the_time(make_env):
+    """Of each world's own episode, to tasks, costs and observations alike."""
+    seen = {}
+    costs = {"step": lambda s: s.step, "seconds": lambda s: s.time}
+
+    def observation(state):
+        seen["observed"] = state.step.tolist()
+        return {"time": state.time[:, None]}
+
+    env = make_env(ArmEnv, num_envs=2, costs=costs, observation=observation, frame_skip=24, seed=0)
+    assert not env.reset()["observation"].any()
+    assert seen["observed"] == env.arm_state.step.tolist() == [0, 0]
+    for count in (1, 2, 3):
+        result = step(env, torch.zeros(2, 3))
+        # 24 substeps of 1/240 s.
+        expected = torch.tensor([[count, count * 0.1]] * 2)
+        torch.testing.assert_close(result["cost"], expected)
+        assert seen["observed"] == [count, count]
+    before = env.arm_state
+    env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, batch_size=[2]))
+    assert env.arm_state.step.tolist() == [0, 3]
+    assert before.step.tolist() == [3, 3], "a state does not change afterwards"
+    torch.testing.assert_close(
+        step(env, torch.zeros(2, 3))["cost"], torch.tensor([[1, 0.1], [4, 0.4]])
+    )
+    other = make_env(ArmEnv, num_envs=2, costs=costs, observation=observation, frame_skip=24)
+    other.load_state_dict(env.state_dict())
+    assert other.arm_state.step.tolist() == [1, 4]
+    np.testing.assert_allclose(other.arm_state.time, [0.1, 0.4])
+    assert np.issubdtype(other.arm_state.step.dtype, np.integer)
+
+
 def test_time_limit_truncates(make_env):
     env = make_env(ArmEnv, num_envs=2, max_episode_steps=3, seed=0)
     rollout = env.rollout(3, lambda td: td.set("action", torch.zeros(2, 3)))
@@ -315,7 +349,7 @@ def test_states_and_resets_do_not_remember_touches(make_env):
     env.reset()
     start = env.arm_state
     while not step(env, towards(env, env.arm_state.obstacle_position[:, 0]))["cost"]:
-        assert env._elapsed < 40
+        assert env.arm_state.step < 40
     # A state is a record: what comes after it does not change it.
     assert start.contact_distance == np.inf
     env.reset()
@@ -389,7 +423,7 @@ class Task(Reach):
         ({"seed": 1.5}, "seed must be a whole number and not negative, got 1.5"),
         ({"observation": lambda s: {}}, "observation must return at least one field"),
         ({"observation": lambda s: {"x": [1.0]}}, "observation field 'x' must have shape"),
-        ({"task": Push(distance=0.16)}, "obstacles must leave .* and the objects where they are"),
+        ({"task": Push(TINY, distance=0.16)}, "obstacles must leave .* and the objects where they"),
         ({"costs": {}}, "costs must name at least one cost"),
         ({"costs": {"flat": lambda state: 0.0}}, r"cost 'flat' must have shape \(1,\), got \(\)"),
         ({"costs": {"nan": always("nan")}}, "cost 'nan' must be finite"),
@@ -401,7 +435,7 @@ class Task(Reach):
         ({"observation": lambda s: {"x": s.contact_distance}}, "observation field 'x' must be fin"),
         ({"obstacles": Places([0.7, 0, 0])}, r"obstacle positions must have shape \(2, 3\), got"),
         ({"obstacles": Places([0.7, 0, 0], [np.nan] * 3)}, "position must be finite"),
-        ({"obstacles": InFront(gap=0.2)}, "obstacles must leave the arm free at home"),
+        ({"obstacles": Places([0.7, 0, 0], HOME)}, "obstacles must leave the arm free at home"),
         ({"obstacles": InFront(gap=0.5)}, "gap must be less than the horizontal distance"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
@@ -458,13 +492,13 @@ def test_closed_environment_says_so(make_env):
     closed.close()
     other = make_env(ArmEnv, seed=0)
     other.reset()
-    before = other._worlds[0].read()
+    before = worlds_of(other)[0].read()
     for use in (lambda: step(closed, torch.ones(1, 3)), closed.reset, closed.render):
         with pytest.raises(RuntimeError, match="This ArmEnv is closed"):
             use()
     with pytest.raises(pybullet.error, match="Not connected"):
-        closed._worlds[0].advance([0.0] * 7, [], 12)
-    assert other._worlds[0].read() == before
+        worlds_of(closed)[0].advance([0.0] * 7, [], 12)
+    assert worlds_of(other)[0].read() == before
 
 
 @pytest.mark.parametrize("copier", [copy.deepcopy, pickle.dumps], ids=["deepcopy", "pickle"])

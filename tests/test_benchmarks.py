@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from bullet_worlds import worlds_of
 
 from benchmarks.floor import Tape
 from benchmarks.handwritten import HandWritten, arguments
@@ -67,7 +68,7 @@ def test_floor_moves_the_worlds_as_the_environment_did():
     moved = env._simulator.state().joint_position
     play()
     tape.play()
-    np.testing.assert_array_equal([world.read()[:7] for world in env._worlds], moved)
+    np.testing.assert_array_equal([world.read()[:7] for world in worlds_of(env)], moved)
     env.close()
 
 

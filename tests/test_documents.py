@@ -1,11 +1,17 @@
 """What the documents show runs: the README's training loop, and every tutorial."""
 
+import math
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_safe.envs import ArmEnv, NoObstacles
 
 ROOT = Path(__file__).parent.parent
 
@@ -57,11 +63,38 @@ def test_readme_recipes(tmp_path):
 def test_environments(tmp_path):
     """Each block runs by itself, and each environment in it is one."""
     blocks = code_of("docs/environments.md")
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     script = tmp_path / "environments.py"
     check = "env.reset()\nenv.close()\n"
     script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")
     run(script)
+
+
+def test_the_circle_is_followed():
+    """What environments.md shows as a task: going where the target is keeps the tool at it."""
+    names = {"__name__": __name__}
+    exec(code_of("docs/environments.md")[0], names)
+    names["env"].close()
+    env = ArmEnv(
+        task=names["task"], observation=names["observation"], obstacles=NoObstacles(), seed=0
+    )
+    env.reset()
+    field = env.observation_fields["to_target"]
+    angles, misses = [], []
+    for step in range(80):
+        state = env.arm_state
+        assert state.step.tolist() == [step]
+        action = torch.tensor(names["task"].to_target(state) / 0.05, dtype=torch.float32)
+        after = env.step(TensorDict({"action": action}, batch_size=[1]))["next"]
+        seen = after["observation"][0, field]
+        assert -seen.norm() == pytest.approx(after["reward"].item(), abs=1e-6)
+        x, y, _ = (env.arm_state.ee_position - env.arm_state.goal)[0]
+        angles.append(math.atan2(y, x))
+        misses.append(seen.norm().item())
+    env.close()
+    # In 4 s once round; behind by what the target does in a control step, 4 mm.
+    assert max(misses[20:]) < 0.012
+    assert np.unwrap(angles[20:])[-1] - angles[20] == pytest.approx(2 * math.pi * 59 / 80, abs=0.1)
 
 
 def test_algorithms(tmp_path):

@@ -35,7 +35,7 @@ from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placeme
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS, paper_env
 from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
 from torchrl_safe.envs.physics.simulator import Physics, Simulator
-from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.saute import Saute
 from torchrl_safe.envs.scene import Camera, Scene
 from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
@@ -80,6 +80,7 @@ __all__ = [
     "Motion",
     "Moving",
     "NoObstacles",
+    "NoRoomError",
     "Obstacles",
     "Patrol",
     "Physics",

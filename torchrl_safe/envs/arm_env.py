@@ -147,7 +147,6 @@ class ArmEnv(EnvBase):
         self.observation = observation
         self.physics = physics
         self.scene = replace(scene, free_fingers=scene.free_fingers or action.moves_fingers)
-        self._elapsed = np.zeros(num_envs, dtype=int)
         self._begun = False
         # States of the generators before the running episodes were drawn.
         self._draws = np.zeros((num_envs, PACKED_SIZE), dtype=np.uint8)
@@ -281,10 +280,9 @@ class ArmEnv(EnvBase):
         if self.scene.motor_limits:
             joints, fingers = self._within_speed(joints, fingers)
         self._simulator.advance(joints, fingers)
-        self._elapsed += 1
         self._state = state = self._simulator.state()
         reward, cost, success = self._outcome(state)
-        truncated = (self._elapsed >= self.max_episode_steps)[:, None] & ~success
+        truncated = (state.step >= self.max_episode_steps)[:, None] & ~success
         return self._pack(
             observation=self._observe(state),
             success=success,
@@ -319,7 +317,6 @@ class ArmEnv(EnvBase):
         arrays = {
             "generators": np.stack([pack(generator) for generator in self._generators]),
             "draws": self._draws,
-            "elapsed": self._elapsed,
             **{_PHYSICS + name: array for name, array in self._simulator.save().items()},
         }
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
@@ -348,7 +345,6 @@ class ArmEnv(EnvBase):
             }
         )
         self._begun = True
-        self._elapsed = arrays["elapsed"]
         self._generators = [unpack(packed) for packed in arrays["generators"]]
         self._state = self._simulator.state()
 
@@ -414,7 +410,6 @@ class ArmEnv(EnvBase):
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:
         self._draws[row] = pack(generator)
         self._starts.begin(row, generator)
-        self._elapsed[row] = 0
 
     def _observe(self, state: ArmState) -> Array:
         fields = self.observation(state).values()

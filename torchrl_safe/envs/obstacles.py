@@ -16,7 +16,7 @@ from torchrl_safe.envs.checks import (
     check_not_negative,
     check_positive,
 )
-from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector
 from torchrl_safe.envs.shapes import Cylinder, Shape, footprint
 from torchrl_safe.envs.state import Array
@@ -107,14 +107,17 @@ class Obstacles(Protocol):
     def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
         """Places one world's obstacles for an episode.
 
-        The environment asks again, up to 100 times, while an obstacle touches the arm at home or
-        an object.
+        While an obstacle touches the arm at home or an object, the environment draws another
+        goal and asks again.
 
         Args:
             rng: the generator of the world.
             start: where the way to the goal begins, m, shape ``(3,)``: the tool point at home,
                 or the object that the task moves.
             goal: target position, m, shape ``(3,)``.
+
+        Raises:
+            NoRoomError: if they find no room here. The environment draws another goal.
         """
 
 
@@ -149,7 +152,8 @@ class InFront:
 
     Raises:
         ValueError: if ``gap`` leaves the goal inside the obstacle or ``direction`` is not
-            horizontal; when a goal is drawn that leaves no room for the obstacle before it.
+            horizontal.
+        NoRoomError: in :meth:`sample`, if the goal is no further than ``gap`` from the start.
 
     Examples:
         >>> InFront(gap=0.2).shapes
@@ -187,7 +191,7 @@ class InFront:
         way[2] = 0
         length = np.linalg.norm(way)
         if self.direction is None and length <= self.gap:
-            raise ValueError(
+            raise NoRoomError(
                 f"gap must be less than the horizontal distance from the start to the goal, got a "
                 f"gap of {self.gap} and a distance of {length:.3f}."
             )
@@ -213,8 +217,9 @@ class Scattered:
         spacing: smallest horizontal distance between two obstacles, m.
 
     Raises:
-        ValueError: if an argument is not usable, or the region has no room for ``count``
-            obstacles beside start and goal.
+        ValueError: if an argument is not usable.
+        NoRoomError: in :meth:`sample`, if the region has no room for ``count`` obstacles beside
+            start and goal.
 
     Examples:
         >>> layout = Scattered(count=4, fewest=0)
@@ -266,7 +271,7 @@ class Scattered:
             from_others = np.linalg.norm(others[:, :2] - place[:2], axis=1) - 2 * radius
             if (from_ends >= self.clearance).all() and (from_others >= self.spacing).all():
                 return place
-        raise ValueError(
+        raise NoRoomError(
             f"region must have room for {self.count} obstacles, {self.clearance} m from start "
             f"{start.round(3).tolist()} and goal {goal.round(3).tolist()}, got {self.region}."
         )

@@ -11,6 +11,19 @@ from torchrl_safe.envs.checks import check_array
 from torchrl_safe.envs.state import Array
 
 
+class NoRoomError(ValueError):
+    """A draw has found no room; :class:`~torchrl_safe.envs.ArmEnv` then draws again.
+
+    Raise it in the ``sample`` of a task or a layout of your own where another goal, or the next
+    numbers of the generator, may do better. Any other error ends the run.
+
+    Examples:
+        >>> raise NoRoomError("gap must be less than the way to the goal.")
+        Traceback (most recent call last):
+        torchrl_safe.envs.regions.NoRoomError: gap must be less than the way to the goal.
+    """
+
+
 @dataclass(frozen=True)
 class Region:
     """A box with its sides along the axes of the world.

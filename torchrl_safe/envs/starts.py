@@ -9,16 +9,23 @@ from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.kinematics import distance_to_reach
 from torchrl_safe.envs.obstacles import Obstacles, Placement
 from torchrl_safe.envs.physics.simulator import Simulator
+from torchrl_safe.envs.regions import NoRoomError
 from torchrl_safe.envs.state import Array
 from torchrl_safe.envs.tasks import Task
 
-# Episodes that are tried when an environment is made; how near, in m, counts as reached there;
-# and how often obstacles are drawn until they leave the arm free.
-_CHECKED_STARTS, _REACHED, _ATTEMPTS = 50, 0.02, 100
+# Episodes that are begun when an environment is made; how near, in m, counts as reached there.
+_CHECKED_STARTS, _REACHED = 50, 0.02
+# Draws for a start that is checked, and for one of a run. Whatever share of the draws is unusable,
+# passing the check and then failing in a given episode has a probability below 1e-11.
+_CHECKED_DRAWS, _DRAWS = 100, 1000
 
 
 class Starts:
     """Draws goal, objects and obstacles, and puts a world there.
+
+    A draw is unusable if task or layout raise :class:`~torchrl_safe.envs.NoRoomError`, or if an
+    obstacle touches the arm at home or an object. Then all of it is drawn anew, the goal too: a
+    layout may have no choice where the goal leaves none.
 
     Args:
         arm: the arm.
@@ -39,11 +46,11 @@ class Starts:
         of training.
 
         Raises:
-            ValueError: if the arm does not reach what the task draws, or is not free.
+            ValueError: if the arm does not reach what the task draws, or is hardly ever free.
         """
         generator = np.random.default_rng(0)
         for _ in range(_CHECKED_STARTS):
-            goal, objects = self._draw_task(generator)
+            goal, objects = self._begin(0, generator, _CHECKED_DRAWS)
             for name, points in (("goals", goal[None]), ("objects", objects)):
                 for point in points:
                     miss = distance_to_reach(self._simulator, self._arm.home, point)
@@ -54,24 +61,35 @@ class Starts:
                             f"stays {miss:.3f} m away: give the task another region, or the "
                             "arm other goals."
                         )
-            self.begin(0, generator)
 
     def begin(self, row: int, generator: np.random.Generator) -> None:
         """Begins an episode in one world.
 
         Raises:
-            ValueError: if what is drawn is not usable, or never leaves the arm free.
+            ValueError: if what is drawn has a wrong shape or is not finite.
         """
-        goal, objects = self._draw_task(generator)
-        for _ in range(_ATTEMPTS):
-            placement = self._draw_obstacles(generator, goal, objects)
-            self._simulator.reset(row, placement, goal, objects)
-            if (clearance := self._simulator.clearance(row)) > 0:
-                return
-        raise ValueError(
-            f"obstacles must leave the arm free at home and the objects where they are, got an "
-            f"overlap of {-clearance:.4f} m from {self._obstacles}."
-        )
+        self._begin(row, generator, _DRAWS)
+
+    def _begin(self, row: int, generator: np.random.Generator, draws: int) -> tuple[Array, Array]:
+        """Begins an episode within so many draws; returns its goal and objects."""
+        for _ in range(draws):
+            try:
+                goal, objects = self._draw_task(generator)
+                placement = self._draw_obstacles(generator, goal, objects)
+                self._simulator.reset(row, placement, goal, objects)
+                self._check_free(row)
+            except NoRoomError as error:
+                last = error
+            else:
+                return goal, objects
+        raise ValueError(f"{last} None of {draws} draws of {self._task} was usable.")
+
+    def _check_free(self, row: int) -> None:
+        if (clearance := self._simulator.clearance(row)) <= 0:
+            raise NoRoomError(
+                f"obstacles must leave the arm free at home and the objects where they are, got an "
+                f"overlap of {-clearance:.4f} m from {self._obstacles}."
+            )
 
     def _draw_task(self, generator: np.random.Generator) -> tuple[Array, Array]:
         goal, objects = self._task.sample(generator, self._arm.goals)

@@ -88,7 +88,7 @@ class Sensor(Protocol):
 
 @dataclass(frozen=True)
 class ArmState:
-    """State of N worlds after a control step, in SI units and world coordinates.
+    """State of N worlds after a control step or a reset, in SI units and world coordinates.
 
     n is the number of arm joints, f of free finger joints, p of objects that the task moves, m
     of obstacles. Orientations are quaternions (x, y, z, w).
@@ -118,6 +118,8 @@ class ArmState:
             they overlap, infinite where the simulator reports no contact.
         contact_force: largest force between arm and obstacle in any of these substeps: the sum
             of the normal forces at its contact points, N, ``(N, m)``.
+        step: control steps since the episode began, int, ``(N,)``; 0 after a reset.
+        time: simulated time since the episode began, s, ``(N,)``.
         trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
     """
 
@@ -142,4 +144,6 @@ class ArmState:
     obstacle_size: Array
     contact_distance: Array
     contact_force: Array
+    step: NDArray[np.int_]
+    time: Array
     trace: Mapping[str, Array] = field(default_factory=Trace)

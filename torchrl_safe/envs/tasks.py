@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_safe.envs.checks import check_kind, check_positive
-from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.shapes import Box, Shape
 from torchrl_safe.envs.state import ArmState, Array
 
@@ -31,6 +31,9 @@ class Task(Protocol):
         Args:
             rng: the generator of the world.
             goals: where the arm can reach goals (:attr:`~torchrl_safe.envs.ArmModel.goals`).
+
+        Raises:
+            NoRoomError: if this draw has failed. The environment draws again.
         """
 
     def reward(self, state: ArmState) -> Array:
@@ -109,8 +112,8 @@ class Push:
 
     Raises:
         TypeError: if ``region`` or ``shape`` is not of its kind.
-        ValueError: if a length is not positive or the shape has no mass; when the region is
-            too small for the distance.
+        ValueError: if a length is not positive or the shape has no mass.
+        NoRoomError: in :meth:`sample`, if the region is too small for the distance.
 
     Examples:
         >>> region = Region((0.5, -0.2, 0.0), (0.6, 0.2, 0.0))
@@ -167,7 +170,8 @@ class PickAndPlace:
     Raises:
         TypeError: if ``region`` or ``shape`` is not of its kind.
         ValueError: if a length is not positive, the shape has no mass or ``on_table`` is not a
-            share; when the region is too small for the distance, or the fingers do not move.
+            share; in :meth:`reward`, if the fingers do not move.
+        NoRoomError: in :meth:`sample`, if the region is too small for the distance.
 
     Examples:
         >>> PickAndPlace(on_table=0.0).objects
@@ -243,6 +247,6 @@ def _apart(
         if wide.any():
             goal, place = pairs[wide.argmax()]
             return goal, place[None]
-    raise ValueError(
+    raise NoRoomError(
         f"region must be wide enough for goals at a distance of {distance} m, got {region}."
     )

@@ -89,7 +89,9 @@ class Simulator(Protocol):
     def state(self) -> ArmState:
         """Returns the state of all worlds after the last :meth:`advance`, or reset of a row.
 
-        In arrays of its own: later steps do not change them.
+        In arrays of its own: later steps do not change them. ``step`` counts the control steps
+        since the row's reset, of which :meth:`restore` brings back the number too; ``time`` is
+        that times ``frame_skip`` times :data:`~torchrl_safe.envs.scene.SUBSTEP`.
         """
 
     def tool_at(self, joints: Array) -> tuple[Array, Array]:

@@ -18,15 +18,15 @@ class TargetRecord:
     """
 
     def __init__(self, num_envs: int) -> None:
-        # Steps of each episode, shape (N,), and targets of joints and fingers in each of them,
-        # shape (N, steps, width).
-        self._steps = np.zeros(num_envs, dtype=int)
+        #: Steps of each episode, shape (N,).
+        self.steps = np.zeros(num_envs, dtype=int)
+        # Targets of joints and fingers in each of them, shape (N, steps, width).
         self._targets: Array = np.zeros((num_envs, 0, 0))
         self._rows = np.arange(num_envs)
 
     def begin(self, row: int) -> None:
         """Notes that an episode begins."""
-        self._steps[row] = 0
+        self.steps[row] = 0
 
     def add(self, joints: Array, fingers: Array) -> None:
         """Notes a step of all worlds.
@@ -37,7 +37,7 @@ class TargetRecord:
         """
         targets = np.concatenate([joints, fingers], axis=1)
         count, room, _ = self._targets.shape
-        last = int(self._steps.max())
+        last = int(self.steps.max())
         if not last:  # A long episode before leaves nothing behind.
             self._targets, room = self._targets[:, :0], 0
         if last >= room:
@@ -45,19 +45,19 @@ class TargetRecord:
             if room:
                 longer[:, :room] = self._targets
             self._targets = longer
-        self._targets[self._rows, self._steps] = targets
-        self._steps += 1
+        self._targets[self._rows, self.steps] = targets
+        self.steps += 1
 
     def rows(self) -> Iterator[Array]:
         """The targets of each world since its reset, each ``(steps, width)``."""
-        for targets, steps in zip(self._targets, self._steps, strict=True):
+        for targets, steps in zip(self._targets, self.steps, strict=True):
             yield targets[:steps]
 
     def save(self) -> Saved:
         """Returns all that was noted."""
-        longest = self._steps.max()
-        return {"steps": self._steps.copy(), "targets": self._targets[:, :longest].copy()}
+        longest = self.steps.max()
+        return {"steps": self.steps.copy(), "targets": self._targets[:, :longest].copy()}
 
     def restore(self, saved: Saved) -> None:
         """Takes what :meth:`save` returned."""
-        self._steps, self._targets = saved["steps"].copy(), saved["targets"].copy()
+        self.steps, self._targets = saved["steps"].copy(), saved["targets"].copy()

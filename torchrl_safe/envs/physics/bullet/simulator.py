@@ -16,7 +16,7 @@ from torchrl_safe.envs.physics.bullet.readings import Vector, velocity_at
 from torchrl_safe.envs.physics.bullet.record import TargetRecord
 from torchrl_safe.envs.physics.bullet.world import TOOL_MOTION, World
 from torchrl_safe.envs.physics.simulator import Saved
-from torchrl_safe.envs.scene import Camera, Scene
+from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 
@@ -126,6 +126,8 @@ class BulletSimulator:
             obstacle_size=self._sizes,
             contact_distance=self._contact_distance.copy(),
             contact_force=self._contact_force.copy(),
+            step=self._targets.steps.copy(),
+            time=self._targets.steps * self._frame_skip * SUBSTEP,
             trace=Trace(
                 split(np.array(self._measured), self._trace_parts) if self._trace_parts else {}
             ),
