@@ -1,0 +1,79 @@
+"""Motors that do within a control step what an action asks for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from torchrl_safe.envs.physics.mujoco.arm import ArmParts
+from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.scene import SUBSTEP
+from torchrl_safe.envs.state import Array
+
+# How fast the motors of the joints correct, rad/s; higher, they chatter where efforts end.
+_RATE = 120.0
+# Of fingers, N/m and N s/m: stiff enough to hold what they hold with all their effort.
+_FINGER_STIFFNESS, _FINGER_DAMPING = 1e4, 500.0
+#: The group of the fingers' motors, which rest where an action moves no fingers.
+FINGER_GROUP = 1
+
+
+def add_motors(spec: Any, parts: ArmParts, *, limited: bool) -> None:
+    """Adds a position and a velocity servo to each joint: first all positions, then velocities.
+
+    Args:
+        spec: the world; changed in place.
+        parts: of the arm.
+        limited: keep the two of a joint together within its effort.
+    """
+    names = parts.joints + parts.fingers
+    for kind in ("position", "velocity"):
+        for name in names:
+            motor = spec.add_actuator(
+                name=f"{name}/{kind}", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+            )
+            motor.group = FINGER_GROUP if name in parts.fingers else 0
+            # The gains follow when the masses are known.
+            if kind == "position":
+                motor.set_to_position(kp=1.0, kv=0.0)
+            else:
+                motor.set_to_velocity(kv=1.0)
+    for name, effort in zip(names, parts.effort.tolist(), strict=True):
+        if limited and np.isfinite(effort):
+            joint = spec.joint(name)
+            joint.actfrclimited, joint.actfrcrange = True, (-effort, effort)
+
+
+def set_gains(model: Any, parts: ArmParts, mass: Array) -> None:
+    """Makes the servos of each joint critically damped for what it has to move at home.
+
+    Args:
+        model: the compiled world; changed in place.
+        parts: of the arm.
+        mass: the diagonal of the mass matrix for joints and fingers, kg m^2 and kg.
+    """
+    joints, count = len(parts.joints), len(mass)
+    stiffness, damping = mass * _RATE**2, 2 * mass * _RATE
+    stiffness[joints:], damping[joints:] = _FINGER_STIFFNESS, _FINGER_DAMPING
+    position, velocity = slice(0, count), slice(count, 2 * count)
+    model.actuator_gainprm[position, 0] = stiffness
+    model.actuator_biasprm[position, 1] = -stiffness
+    model.actuator_gainprm[velocity, 0] = damping
+    model.actuator_biasprm[velocity, 2] = -damping
+
+
+def fill_controls(controls: Array, current: Array, targets: Array) -> None:
+    """Writes the controls of a control step: targets that move evenly over the substeps.
+
+    Args:
+        controls: what is written, ``(N, s, 2 k)``.
+        current: where joints and fingers are, ``(N, k)``.
+        targets: where they are to be after the last substep, ``(N, k)``.
+    """
+    substeps, count = controls.shape[1], current.shape[1]
+    change = targets - current
+    share = np.arange(1, substeps + 1)[:, None] / substeps
+    np.multiply(change[:, None], share, out=controls[:, :, :count])
+    controls[:, :, :count] += current[:, None]
+    controls[:, :, count:] = (change / (substeps * SUBSTEP))[:, None]
