@@ -74,7 +74,7 @@ def build_world(
     for index, shape in enumerate(objects):
         add_object(spec, index, shape)
     add_motors(spec, parts, limited=scene.motor_limits)
-    sensors = Sensors(spec, parts, shapes, objects, sensing)
+    sensors = Sensors(spec, parts, shapes, sensing)
     model, data = _at_home(spec, arm, parts)
     exclude_overlaps(spec, links, model, data)
     mass = np.zeros((model.nv, model.nv))
