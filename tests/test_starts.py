@@ -5,7 +5,6 @@ from itertools import product
 import numpy as np
 import pytest
 from draws import misses, tool_at_home
-from torchrl_safe.envs.record import pack
 from worlds import Places
 
 from torchrl_safe.envs import (
@@ -20,6 +19,7 @@ from torchrl_safe.envs import (
     Reach,
     Region,
 )
+from torchrl_safe.envs.generators import pack
 from torchrl_safe.envs.gym import ARMS, OBSTACLES, TASKS, combination
 
 # Now and then a goal is drawn that leaves no room between it and the arm at home.

@@ -25,7 +25,7 @@ from torchrl_safe.envs.physics.bullet.engine import pybullet
 from torchrl_safe.envs.physics.bullet.readings import MovingBody, Readings, Vector, link_state
 from torchrl_safe.envs.physics.paths import look_ahead
 from torchrl_safe.envs.rotations import UPRIGHT
-from torchrl_safe.envs.scene import Camera, Scene
+from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import Array, Sensing
 
@@ -37,6 +37,8 @@ _RED, _YELLOW, _BLUE = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.15, 0.4,
 TOOL_MOTION = ("ee_centre", "ee_centre_velocity", "ee_angular_velocity")
 _LIMBO = (0.0, 0.0, -100.0)
 _AT_REST = (0.0, 0.0, 0.0)
+# Share of the way that a motor is behind its moving target which it makes good in a substep.
+_CATCH_UP = 0.5
 
 
 class World:
@@ -240,12 +242,14 @@ class World:
             measurements of :meth:`measure`.
         """
         client, arm = self._client, self._arm.body
-        self._command(joint_target, finger_target, self._options.motor_gain or 1 / substeps)
+        commands = self._commands([*joint_target, *finger_target], substeps)
         distances = [math.inf] * len(self._obstacles)
         forces = [0.0] * len(self._obstacles)
         measurements = []
         ways = None if self._placement.path is None else self._look_ahead(substeps)
         for substep in range(1, substeps + 1):
+            if substep <= len(commands):
+                self._command(**commands[substep - 1])
             pybullet.stepSimulation(physicsClientId=client)
             for index in self._present:
                 points = pybullet.getContactPoints(
@@ -263,17 +267,31 @@ class World:
         self._substeps += substeps
         return distances, forces, measurements
 
-    def _command(self, joint_target: Vector, finger_target: Vector, gain: float) -> None:
-        targets = [*joint_target, *finger_target]
-        count = len(targets)
+    def _commands(self, targets: Vector, substeps: int) -> list[dict[str, list[float]]]:
+        """What the motors are told in the first substeps of a control step, and keep."""
+        count, gain = len(targets), self._options.motor_gain
+        if gain is not None:
+            return [{"targetPositions": list(targets), "positionGains": [gain] * count}]
+        # A motor sets the velocity to the target's, and to what takes it a share of the way that
+        # it is behind; that of a target that moves evenly is where it is before the substep.
+        start = np.array([state[0] for state in self._joint_states()[:count]])
+        change = (targets - start) / substeps
+        follow = {
+            "targetVelocities": (change / SUBSTEP).tolist(),
+            "positionGains": [_CATCH_UP] * count,
+        }
+        ways = (start + np.arange(substeps)[:, None] * change).tolist()
+        return [{"targetPositions": way, **follow} for way in ways]
+
+    def _command(self, **motors: list[float]) -> None:
+        count = len(motors["targetPositions"])
         limits = {"forces": self._arm.effort[:count]} if self._scene.motor_limits else {}
         pybullet.setJointMotorControlArray(
             self._arm.body,
             self._driven[:count],
             pybullet.POSITION_CONTROL,
-            targetPositions=targets,
-            positionGains=[gain] * count,
             physicsClientId=self._client,
+            **motors,
             **limits,
         )
 
