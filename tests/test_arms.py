@@ -22,7 +22,7 @@ from torchrl_safe.envs import (
     Reach,
     Scene,
 )
-from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
+from torchrl_safe.envs.arms.urdf import find_urdf, prepare_urdf
 
 
 class Pose:

@@ -23,7 +23,7 @@ from torchrl_safe.envs import (
     Placement,
     Region,
 )
-from torchrl_safe.envs.scene import Scene
+from torchrl_safe.envs.physics.scene import Scene
 
 
 def open_clients():

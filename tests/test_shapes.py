@@ -15,8 +15,8 @@ from torchrl_safe.envs import (
     Region,
     Sphere,
 )
-from torchrl_safe.envs.scene import Scene
-from torchrl_safe.envs.shapes import footprint
+from torchrl_safe.envs.obstacles.shapes import footprint
+from torchrl_safe.envs.physics.scene import Scene
 
 SHAPES = {
     "cylinder": Cylinder(radius=0.03, height=0.16, mass=0.3),

@@ -8,8 +8,8 @@ import pytest
 from bullet_worlds import make_world
 
 from torchrl_safe.envs import PANDA, ArmModel, Gripper, Placement
+from torchrl_safe.envs.arms.urdf import find_urdf, prepare_urdf
 from torchrl_safe.envs.gym import ARMS
-from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
 
 
 def arm(path, ee_link, gripper=None):

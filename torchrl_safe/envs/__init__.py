@@ -26,22 +26,33 @@ from torchrl_safe.envs.costs import (
     SpeedAndSeparation,
     Workspace,
 )
-from torchrl_safe.envs.early_termination import EarlyTermination
-from torchrl_safe.envs.human import Human
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
-from torchrl_safe.envs.moving import Motion, Moving, Patrol, Swing
 from torchrl_safe.envs.observations import FullObservation, paper_observation
-from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placement, Scattered
+from torchrl_safe.envs.obstacles import (
+    Box,
+    Capsule,
+    Cylinder,
+    Human,
+    InFront,
+    Motion,
+    Moving,
+    NoObstacles,
+    Obstacles,
+    Patrol,
+    Placement,
+    Scattered,
+    Shape,
+    Sphere,
+    Swing,
+)
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS, paper_env
 from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
+from torchrl_safe.envs.physics.scene import Camera, Scene
 from torchrl_safe.envs.physics.simulator import Physics, Simulator
 from torchrl_safe.envs.regions import NoRoomError, Region
-from torchrl_safe.envs.saute import Saute
-from torchrl_safe.envs.scene import Camera, Scene
-from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
-from torchrl_safe.envs.transforms import CostToReward
+from torchrl_safe.envs.transforms import CostToReward, EarlyTermination, Saute
 
 __all__ = [
     "IIWA",

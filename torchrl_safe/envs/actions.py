@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_array, check_positive
+from torchrl_safe._checks import check_array, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply

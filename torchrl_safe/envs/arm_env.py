@@ -17,17 +17,16 @@ from torchrl._utils import seed_generator
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_safe._checks import check_count
+from torchrl_safe._checks import check_array, check_count, check_kind
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta
 from torchrl_safe.envs.arms import PANDA, ArmModel
-from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.generators import PACKED_SIZE, pack, unpack
 from torchrl_safe.envs.observations import FullObservation
 from torchrl_safe.envs.obstacles import InFront, Obstacles
 from torchrl_safe.envs.physics.bullet import Bullet
+from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Physics
-from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.starts import Starts
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Sensor
 from torchrl_safe.envs.tasks import Reach, Task

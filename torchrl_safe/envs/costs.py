@@ -11,7 +11,7 @@ from numbers import Real
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_kind, check_not_negative, check_positive
+from torchrl_safe._checks import check_kind, check_not_negative, check_positive
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.state import ArmState, Array, Sensing
 

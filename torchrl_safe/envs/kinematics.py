@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_positive
+from torchrl_safe._checks import check_positive
 from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import rotation_vector
 from torchrl_safe.envs.state import ArmState, Array

@@ -14,10 +14,10 @@ from torchrl_safe.envs.arms import PANDA
 from torchrl_safe.envs.costs import CONTACT_RANGE, Collision
 from torchrl_safe.envs.observations import paper_observation
 from torchrl_safe.envs.obstacles import InFront
+from torchrl_safe.envs.obstacles.shapes import Cylinder
 from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
+from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.regions import Region
-from torchrl_safe.envs.scene import Scene
-from torchrl_safe.envs.shapes import Cylinder
 from torchrl_safe.envs.tasks import Reach
 
 #: AR1: displacements of the tool point and the position of the fingers, not clipped.

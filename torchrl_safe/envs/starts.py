@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_safe._checks import check_array, check_kind
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.kinematics import distance_to_reach
 from torchrl_safe.envs.obstacles import Obstacles, Placement
 from torchrl_safe.envs.physics.simulator import Simulator

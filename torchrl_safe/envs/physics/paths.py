@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe.envs.physics.scene import SUBSTEP
 from torchrl_safe.envs.rotations import rotation_vector
-from torchrl_safe.envs.scene import SUBSTEP
 from torchrl_safe.envs.state import Array
 
 

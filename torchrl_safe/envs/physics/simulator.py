@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Placement
-from torchrl_safe.envs.scene import Camera, Scene
-from torchrl_safe.envs.shapes import Shape
+from torchrl_safe.envs.obstacles.shapes import Shape
+from torchrl_safe.envs.physics.scene import Camera, Scene
 from torchrl_safe.envs.state import ArmState, Array, Sensing
 
 #: What :meth:`Simulator.save` returns: arrays by name, the worlds along the first axis of each.
@@ -91,7 +91,7 @@ class Simulator(Protocol):
 
         In arrays of its own: later steps do not change them. ``step`` counts the control steps
         since the row's reset, of which :meth:`restore` brings back the number too; ``time`` is
-        that times ``frame_skip`` times :data:`~torchrl_safe.envs.scene.SUBSTEP`.
+        that times ``frame_skip`` times :data:`~torchrl_safe.envs.physics.scene.SUBSTEP`.
         """
 
     def tool_at(self, joints: Array) -> tuple[Array, Array]:
@@ -178,7 +178,7 @@ class Physics(Protocol):
             objects: the p objects that the task moves.
             sensing: what is measured in every substep besides contacts.
             frame_skip: substeps of a control step, each of
-                :data:`~torchrl_safe.envs.scene.SUBSTEP` seconds.
+                :data:`~torchrl_safe.envs.physics.scene.SUBSTEP` seconds.
             gui: show the first world in a window.
 
         Raises:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.arms.urdf import prepare_urdf
+from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.physics.bullet.engine import pybullet, pybullet_data
-from torchrl_safe.envs.scene import Scene
-from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.state import Array
-from torchrl_safe.envs.urdf import prepare_urdf
 
 _WOOD = (0.72, 0.58, 0.42, 1.0)
 _UNLIMITED_EFFORT = 1e5

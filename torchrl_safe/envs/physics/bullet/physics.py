@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from torchrl_safe._checks import check_positive
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.checks import check_positive
+from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.simulator import BulletSimulator
-from torchrl_safe.envs.scene import Scene
-from torchrl_safe.envs.shapes import Shape
+from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.state import Sensing
 
 

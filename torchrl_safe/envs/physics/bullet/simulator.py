@@ -12,12 +12,12 @@ import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.readings import Vector, velocity_at
 from torchrl_safe.envs.physics.bullet.record import TargetRecord
 from torchrl_safe.envs.physics.bullet.world import TOOL_MOTION, World
+from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Saved
-from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
-from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 
 if TYPE_CHECKING:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.bodies import (
     add_marker,
     add_shape,
@@ -24,9 +25,8 @@ from torchrl_safe.envs.physics.bullet.bodies import (
 from torchrl_safe.envs.physics.bullet.engine import pybullet
 from torchrl_safe.envs.physics.bullet.readings import MovingBody, Readings, Vector, link_state
 from torchrl_safe.envs.physics.paths import look_ahead
+from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.rotations import UPRIGHT
-from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
-from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import Array, Sensing
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite
 
-from torchrl_safe.envs.budget import ROUNDING, CostTally
-from torchrl_safe.envs.checks import check_array
+from torchrl_safe._checks import check_array
+from torchrl_safe.envs.transforms.budget import ROUNDING, CostTally
 
 
 class EarlyTermination(CostTally):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from torchrl_safe.envs.checks import check_array, check_kind
+from torchrl_safe._checks import check_array, check_kind
 from torchrl_safe.envs.regions import Region
 
 

@@ -8,9 +8,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_array, check_kind, check_positive
-from torchrl_safe.envs.obstacles import InFront, Obstacles, Placement
-from torchrl_safe.envs.shapes import Shape
+from torchrl_safe._checks import check_array, check_kind, check_positive
+from torchrl_safe.envs.obstacles.layouts import InFront, Obstacles, Placement
+from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.state import Array
 
 

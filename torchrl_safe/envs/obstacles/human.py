@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_array, check_positive
-from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe._checks import check_array, check_positive
+from torchrl_safe.envs.obstacles.layouts import Placement
+from torchrl_safe.envs.obstacles.shapes import Capsule, Shape, Sphere
 from torchrl_safe.envs.rotations import from_z_axis
-from torchrl_safe.envs.shapes import Capsule, Shape, Sphere
 from torchrl_safe.envs.state import Array
 
 # Reaches before the motion repeats itself: more than the usual episode has time for.

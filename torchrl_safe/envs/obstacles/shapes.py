@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_array, check_not_negative, check_positive
+from torchrl_safe._checks import check_array, check_not_negative, check_positive
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Transforms that let environments of others in."""
+"""Lets environments of others in."""
 
 from __future__ import annotations
 

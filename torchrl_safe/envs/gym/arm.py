@@ -1,15 +1,7 @@
-"""Gymnasium, both ways: arms for Gymnasium's users, and Gymnasium's environments with a cost.
-
-Importing this module registers the ready-made combinations of an arm, a task, obstacles and an
-action as ``torchrl_safe/<Arm><Task><Obstacles><Action>-v0``; the names are the keys of ``ARMS``,
-``TASKS``, ``OBSTACLES`` and ``ACTIONS``. Gymnasium's own syntax imports it on the way:
-``gymnasium.make("torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0")``.
-"""
+"""An arm for Gymnasium's users."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import gymnasium
@@ -18,46 +10,7 @@ import torch
 from gymnasium.spaces import Box
 from tensordict import TensorDict
 
-from torchrl_safe.envs.actions import CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
-from torchrl_safe.envs.arms import IIWA, PANDA, UR5, UR10, XARM6, XARM7
-from torchrl_safe.envs.human import Human
-from torchrl_safe.envs.moving import Moving
-from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Scattered
-from torchrl_safe.envs.safe_gym import SafeGymEnv, SafeGymWrapper
-from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
-
-__all__ = [
-    "ACTIONS",
-    "ARMS",
-    "OBSTACLES",
-    "TASKS",
-    "ArmGymEnv",
-    "SafeGymEnv",
-    "SafeGymWrapper",
-    "combination",
-]
-
-#: The parts of the registered names, and what they stand for.
-ARMS = {
-    "Panda": PANDA,
-    "Iiwa": IIWA,
-    "XArm6": XARM6,
-    "XArm7": XARM7,
-    "UR5": UR5,
-    "UR10": UR10,
-}
-TASKS: dict[str, Task] = {"Reach": Reach(), "Push": Push(), "PickAndPlace": PickAndPlace()}
-# Control steps of an episode, at 20 Hz; mostly enough for the scripted pilots of the tests.
-_TIME_LIMITS = {"Reach": 40, "Push": 200, "PickAndPlace": 100}
-OBSTACLES: dict[str, Obstacles] = {
-    "": NoObstacles(),
-    "InFront": InFront(),
-    "Scattered": Scattered(),
-    "Moving": Moving(),
-    "Human": Human(),
-}
-ACTIONS: dict[str, CartesianDelta | JointDelta] = {"": CartesianDelta(), "Joint": JointDelta()}
 
 
 class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -155,41 +108,3 @@ class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     @staticmethod
     def _observation(tensordict: TensorDict) -> np.ndarray:
         return tensordict["observation"][0].cpu().numpy()
-
-
-def combination(arm: str, task: str, obstacles: str, action: str) -> dict[str, Any]:
-    """Returns the arguments of :class:`~torchrl_safe.envs.ArmEnv` for the parts of a name.
-
-    Args:
-        arm: key of ``ARMS``.
-        task: key of ``TASKS``; decides on the time limit too: 40 control steps for ``Reach``, 200
-            for ``Push``, 100 for ``PickAndPlace``.
-        obstacles: key of ``OBSTACLES``.
-        action: key of ``ACTIONS``. To pick something up, it moves the fingers too.
-
-    Examples:
-        >>> env = ArmEnv(num_envs=2, **combination("Panda", "PickAndPlace", "Human", "Joint"))
-        >>> env.action_spec.shape, env.max_episode_steps
-        (torch.Size([2, 8]), 100)
-        >>> env.close()
-    """
-    grasps = isinstance(TASKS[task], PickAndPlace)
-    return {
-        "arm": ARMS[arm],
-        "task": TASKS[task],
-        "obstacles": OBSTACLES[obstacles],
-        "action": replace(ACTIONS[action], finger_step=0.04 if grasps else None),
-        "max_episode_steps": _TIME_LIMITS[task],
-    }
-
-
-def _register() -> None:
-    for parts in product(ARMS, TASKS, OBSTACLES, ACTIONS):
-        gymnasium.register(
-            f"torchrl_safe/{''.join(parts)}-v0",
-            entry_point=f"{__name__}:{ArmGymEnv.__name__}",
-            kwargs=combination(*parts),
-        )
-
-
-_register()

@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase, GymEnv, GymWrapper
 from torchrl.envs.gym_like import BaseInfoDictReader
 from torchrl.envs.libs.gym import terminal_obs_reader
 
-from torchrl_safe.envs.checks import check_array
+from torchrl_safe._checks import check_array
 
 Info = Mapping[str, Any]
 

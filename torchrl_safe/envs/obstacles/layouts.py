@@ -9,16 +9,16 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe._checks import check_count
-from torchrl_safe.envs.checks import (
+from torchrl_safe._checks import (
     check_array,
+    check_count,
     check_kind,
     check_not_negative,
     check_positive,
 )
+from torchrl_safe.envs.obstacles.shapes import Cylinder, Shape, footprint
 from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector
-from torchrl_safe.envs.shapes import Cylinder, Shape, footprint
 from torchrl_safe.envs.state import Array
 
 #: Positions ``(s, m, 3)``, m, and orientations ``(s, m, 4)`` at s times after the start, s.

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from torchrl_safe.envs.arms import ArmModel, Gripper
-from torchrl_safe.envs.urdf_merge import merge_fixed_links
+from torchrl_safe.envs.arms.models import ArmModel, Gripper
+from torchrl_safe.envs.arms.urdf_merge import merge_fixed_links
 
 _PACKAGE = "package://"
 # What the names of an attached gripper begin with, so that they are not those of the arm.

@@ -8,8 +8,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torchrl_safe.envs.budget import ROUNDING, CostTally
-from torchrl_safe.envs.checks import check_array
+from torchrl_safe._checks import check_array
+from torchrl_safe.envs.transforms.budget import ROUNDING, CostTally
 
 
 class Saute(CostTally):
