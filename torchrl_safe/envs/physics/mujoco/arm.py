@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.arms.urdf import prepare_urdf
 from torchrl_safe.envs.physics.mujoco.contacts import set_arm_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.mujoco.inertia import set_box_inertias
 from torchrl_safe.envs.state import Array
-from torchrl_safe.envs.urdf import prepare_urdf
 
 # What MuJoCo's reader of URDF files is told: keep every link, and paths as they are.
 _COMPILER = {"strippath": "false", "balanceinertia": "true", "fusestatic": "false"}

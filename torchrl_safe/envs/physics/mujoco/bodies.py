@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.physics.mujoco.contacts import set_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
-from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
 
 #: Name of the table's shape; its top is at height 0.
 TABLE = "table"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
-from torchrl_safe.envs.scene import SUBSTEP
+from torchrl_safe.envs.physics.scene import SUBSTEP
 
 # Who may touch whom: the arm, what stays where it is put, and what physics moves.
 _ARM, _FIXED, _FREE = 1, 2, 4

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.arm import ArmParts, read_arm
-from torchrl_safe.envs.physics.mujoco.bodies import add_object, add_obstacle, add_table, obstacle
+from torchrl_safe.envs.physics.mujoco.bodies import add_object, add_obstacle, add_table
 from torchrl_safe.envs.physics.mujoco.contacts import exclude_overlaps, set_options
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.mujoco.motors import add_motors, set_gains
 from torchrl_safe.envs.physics.mujoco.readings import CONTACT_RANGE, Place, Sensors
-from torchrl_safe.envs.scene import Scene
-from torchrl_safe.envs.shapes import Shape
+from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.state import Array, Sensing
 
 

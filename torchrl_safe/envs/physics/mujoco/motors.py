@@ -8,11 +8,13 @@ import numpy as np
 
 from torchrl_safe.envs.physics.mujoco.arm import ArmParts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
-from torchrl_safe.envs.scene import SUBSTEP
+from torchrl_safe.envs.physics.scene import SUBSTEP
 from torchrl_safe.envs.state import Array
 
-# How fast the motors of the joints correct, rad/s; higher, they chatter where efforts end.
-_RATE = 120.0
+# How fast the motors of the joints correct, rad/s. Their damping then stops a joint within one
+# substep; with more, motors at the end of their efforts, which MuJoCo does not treat implicitly,
+# would chatter.
+_RATE = 0.5 / SUBSTEP
 # Of fingers, N/m and N s/m: stiff enough to hold what they hold with all their effort.
 _FINGER_STIFFNESS, _FINGER_DAMPING = 1e4, 500.0
 #: The group of the fingers' motors, which rest where an action moves no fingers.
@@ -65,6 +67,10 @@ def set_gains(model: Any, parts: ArmParts, mass: Array) -> None:
 
 def fill_controls(controls: Array, current: Array, targets: Array) -> None:
     """Writes the controls of a control step: targets that move evenly over the substeps.
+
+    With 12 substeps the joints then do what is asked for to within one percent, where efforts
+    allow. They lag by two substeps: of a control step of six they do 0.96, of a single one about
+    0.6, and the rest in the next.
 
     Args:
         controls: what is written, ``(N, s, 2 k)``.

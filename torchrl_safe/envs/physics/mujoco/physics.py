@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 from torchrl_safe._checks import check_count
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.mujoco.simulator import MuJoCoSimulator
-from torchrl_safe.envs.scene import Scene
-from torchrl_safe.envs.shapes import Shape
+from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.state import Sensing
 
 

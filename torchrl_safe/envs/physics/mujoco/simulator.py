@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Placement
+from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.bodies import obstacle, thing
 from torchrl_safe.envs.physics.mujoco.chain import Chain, ToolPose
 from torchrl_safe.envs.physics.mujoco.clearance import Clearance
@@ -21,10 +22,9 @@ from torchrl_safe.envs.physics.mujoco.readings import nearest, touch_distance, t
 from torchrl_safe.envs.physics.mujoco.tracks import Tracks
 from torchrl_safe.envs.physics.mujoco.vectors import turn
 from torchrl_safe.envs.physics.paths import Ways
+from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Saved
 from torchrl_safe.envs.rotations import UPRIGHT
-from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
-from torchrl_safe.envs.shapes import Shape
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 
 # MuJoCo's quaternions are w, x, y, z, ours x, y, z, w.
