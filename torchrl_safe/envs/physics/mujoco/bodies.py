@@ -47,9 +47,7 @@ def add_object(spec: Any, index: int, shape: Shape) -> None:
     _add_body(spec, thing(index), shape, _BLUE, 0.0)
 
 
-def _add_body(
-    spec: Any, name: str, shape: Shape, colour: tuple[float, ...], reach: float
-) -> None:
+def _add_body(spec: Any, name: str, shape: Shape, colour: tuple[float, ...], reach: float) -> None:
     free = shape.mass > 0
     body = spec.worldbody.add_body(name=name, mocap=not free)
     if free:

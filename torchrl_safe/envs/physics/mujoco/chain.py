@@ -97,7 +97,9 @@ def quaternions(matrix: Array) -> Array:
             matrix[:, row, column] + matrix[:, column, row]
         )
     for part, (row, column) in enumerate(((2, 1), (0, 2), (1, 0))):
-        products[:, part, 3] = products[:, 3, part] = matrix[:, row, column] - matrix[:, column, row]
+        products[:, part, 3] = products[:, 3, part] = (
+            matrix[:, row, column] - matrix[:, column, row]
+        )
     chosen = products[np.arange(len(matrix)), largest]
     return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 

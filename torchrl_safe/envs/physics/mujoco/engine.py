@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 try:
     import mujoco
     from mujoco import batch
-except ImportError:
+except (ImportError, AttributeError) as _error:
+    # It raises AttributeError if a library is missing that the variable MUJOCO_GL names.
+    _reason = (
+        f"MuJoCo does not load, see the variable MUJOCO_GL: {_error}."
+        if isinstance(_error, AttributeError)
+        else 'MuJoCo 4 is not installed: pip install "torchrl-safe[mujoco]" (Python 3.11 or newer).'
+    )
 
     class _Missing:
         def __getattr__(self, name: str) -> Any:
-            raise ImportError(
-                'MuJoCo is not installed: pip install "torchrl-safe[mujoco]" (Python 3.11 or newer).'
-            )
+            raise ImportError(_reason)
 
     mujoco = batch = _Missing()
 
-__all__ = ["batch", "mujoco"]
+__all__ = ["batch", "mujoco", "quiet"]
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps MuJoCo from writing a file of what goes wrong, which is raised as an error."""
+    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    silent.logto_file = silent.logto_console = False
+    silent.set()
+    try:
+        yield
+    finally:
+        before.set()

@@ -14,8 +14,10 @@ from torchrl_safe.envs.physics.mujoco.arm import ArmParts, read_arm
 from torchrl_safe.envs.physics.mujoco.bodies import add_object, add_obstacle, add_table
 from torchrl_safe.envs.physics.mujoco.contacts import exclude_overlaps, set_options
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.mujoco.inertia import set_box_inertias
 from torchrl_safe.envs.physics.mujoco.motors import add_motors, set_gains
 from torchrl_safe.envs.physics.mujoco.readings import CONTACT_RANGE, Place, Sensors
+from torchrl_safe.envs.physics.mujoco.scenery import add_scenery, dress_arm
 from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.state import Array, Sensing
 
@@ -28,7 +30,6 @@ class World:
         model: the ``MjModel``.
         parts: names and limits of the arm.
         places: where the readings of each kind are in the sensor data.
-        joints: numbers of the arm's joints, and so of their axes, ``(n,)``.
         position: where arm joints and free fingers are in ``qpos``, ``(n + f,)``.
         velocity: where they are in ``qvel``, ``(n + f,)``.
         home: ``qpos`` with the arm at home.
@@ -37,7 +38,6 @@ class World:
     model: Any
     parts: ArmParts
     places: dict[str, Place]
-    joints: Array
     position: Array
     velocity: Array
     home: Array
@@ -49,30 +49,20 @@ def build_world(
     shapes: Sequence[Shape],
     objects: Sequence[Shape],
     sensing: Sensing,
-    *,
-    visuals: bool = False,
 ) -> World:
     """Builds the world of an environment.
 
     Raises:
         ValueError: if the URDF does not load or the home pose does not fit it.
     """
-    spec, parts = read_arm(
-        arm,
-        fix_fingers=not scene.free_fingers,
-        merge=not objects,
-        couple=scene.motor_limits,
-        visuals=visuals,
-        itself=sensing.itself,
-    )
-    set_options(spec, scene.gravity)
+    spec, parts = _read_arm(arm, scene, objects, itself=sensing.itself)
     links = {body.name for body in spec.bodies[1:]}
-    reach = max(CONTACT_RANGE, sensing.clearance)
-    add_table(spec, reach=CONTACT_RANGE)
-    for index, shape in enumerate(shapes):
-        add_obstacle(spec, index, shape, reach=reach)
-    for index, shape in enumerate(objects):
-        add_object(spec, index, shape)
+    try:
+        set_box_inertias(spec)
+    except ValueError as error:
+        raise ValueError(f"urdf {arm.urdf!r} does not load in MuJoCo: {error}") from error
+    set_options(spec, scene.gravity)
+    _add_bodies(spec, shapes, objects, reach=max(CONTACT_RANGE, sensing.clearance))
     add_motors(spec, parts, limited=scene.motor_limits)
     sensors = Sensors(spec, parts, shapes, sensing)
     model, data = _at_home(spec, arm, parts)
@@ -87,11 +77,53 @@ def build_world(
         model=model,
         parts=parts,
         places=sensors.places,
-        joints=np.array(ids[: len(parts.joints)]),
         position=model.jnt_qposadr[ids],
         velocity=velocity,
         home=data.qpos.copy(),
     )
+
+
+def build_scenery(
+    arm: ArmModel, scene: Scene, shapes: Sequence[Shape], objects: Sequence[Shape]
+) -> Any:
+    """Builds what is to be seen of a world: an ``MjModel`` with the same joints.
+
+    Of what is put in its places from outside, the goal is the last.
+    """
+    spec, _ = _read_arm(arm, scene, objects, visuals=True)
+    dress_arm(spec)
+    _add_bodies(spec, shapes, objects, reach=0.0)
+    add_scenery(spec)
+    return spec.compile()
+
+
+def _read_arm(
+    arm: ArmModel,
+    scene: Scene,
+    objects: Sequence[Shape],
+    *,
+    visuals: bool = False,
+    itself: bool = False,
+) -> tuple[Any, ArmParts]:
+    return read_arm(
+        arm,
+        fix_fingers=not scene.free_fingers,
+        # What touches objects has friction of its own, link by link.
+        merge=not objects,
+        couple=scene.motor_limits,
+        visuals=visuals,
+        itself=itself,
+    )
+
+
+def _add_bodies(
+    spec: Any, shapes: Sequence[Shape], objects: Sequence[Shape], *, reach: float
+) -> None:
+    add_table(spec, reach=CONTACT_RANGE)
+    for index, shape in enumerate(shapes):
+        add_obstacle(spec, index, shape, reach=reach)
+    for index, shape in enumerate(objects):
+        add_object(spec, index, shape)
 
 
 def _at_home(spec: Any, arm: ArmModel, parts: ArmParts) -> tuple[Any, Any]:

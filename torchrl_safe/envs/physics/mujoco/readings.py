@@ -97,7 +97,7 @@ class Sensors:
         data: Sequence[str],
         base: bool = False,
     ) -> None:
-        """Contacts of the arm with each obstacle; with its base where that is asked for, or free."""
+        """Contacts of each obstacle with the arm, its base included on demand, or if it is free."""
         for index, shape in enumerate(shapes):
             arm = self._parts.root if base or shape.mass else self._parts.moving
             self._add_contact(arm, mujoco.mjtObj.mjOBJ_GEOM, obstacle(index), slots, data)
@@ -154,9 +154,7 @@ def touch_distance(data: Array) -> Array:
     return np.where(data[..., 0] > 0, data[..., 1], np.inf)
 
 
-def nearest(
-    data: Array, reach: float, ways: Ways, free: NDArray[np.bool_]
-) -> dict[str, Array]:
+def nearest(data: Array, reach: float, ways: Ways, free: NDArray[np.bool_]) -> dict[str, Array]:
     """Clearance, m, and the speeds at which the closest points approach each other, m/s.
 
     Args:

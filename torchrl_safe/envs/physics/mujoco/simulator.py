@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +14,18 @@ from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.bodies import obstacle, thing
 from torchrl_safe.envs.physics.mujoco.chain import Chain, ToolPose
 from torchrl_safe.envs.physics.mujoco.clearance import Clearance
-from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco
-from torchrl_safe.envs.physics.mujoco.model import build_world
+from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
+from torchrl_safe.envs.physics.mujoco.free import TO_MUJOCO, FreeBodies
+from torchrl_safe.envs.physics.mujoco.model import build_scenery, build_world
 from torchrl_safe.envs.physics.mujoco.motors import FINGER_GROUP, fill_controls
+from torchrl_safe.envs.physics.mujoco.pictures import Painter
 from torchrl_safe.envs.physics.mujoco.readings import nearest, touch_distance, touches
 from torchrl_safe.envs.physics.mujoco.tracks import Tracks
-from torchrl_safe.envs.physics.mujoco.vectors import turn
 from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Saved
 from torchrl_safe.envs.rotations import UPRIGHT
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
-
-# MuJoCo's quaternions are w, x, y, z, ours x, y, z, w.
-_TO_OURS, _TO_MUJOCO = [1, 2, 3, 0], [3, 0, 1, 2]
 
 
 class MuJoCoSimulator:
@@ -87,8 +84,8 @@ class MuJoCoSimulator:
         self._sizes = np.array([shape.half_extents for shape in shapes]).reshape(-1, 3)
         self._is_free = np.array([shape.mass > 0 for shape in shapes], dtype=bool)
         self._tracks = Tracks(num_envs, len(shapes), frame_skip)
-        self._objects = _FreeBodies(model, [thing(index) for index in range(len(objects))])
-        self._free = _FreeBodies(model, [obstacle(i) for i in np.flatnonzero(self._is_free)])
+        self._objects = FreeBodies(model, [thing(index) for index in range(len(objects))])
+        self._free = FreeBodies(model, [obstacle(i) for i in np.flatnonzero(self._is_free)])
         self._goal = np.zeros((num_envs, 3))
         self._steps = np.zeros(num_envs, dtype=int)
         self._contact_distance = np.full((num_envs, len(shapes)), np.inf)
@@ -96,6 +93,7 @@ class MuJoCoSimulator:
         # What depends on where everything is after a substep needs one more look after the last.
         self._looks = bool(sensing.clearance or sensing.tool or sensing.links)
         self._record: dict[str, Array] | None = None
+        self._painter: Painter | None = None
         self._trace: dict[str, Array] = {}
 
     def reset(self, row: int, placement: Placement, goal: Array, objects: Array) -> None:
@@ -105,7 +103,7 @@ class MuJoCoSimulator:
         self._tracks.reset(row, placement)
         now, fixed = self._tracks.now, ~self._is_free
         self._mocap_pos[row] = now.position[row, fixed]
-        self._mocap_quat[row] = now.orientation[row, fixed][:, _TO_MUJOCO]
+        self._mocap_quat[row] = now.orientation[row, fixed][:, TO_MUJOCO]
         self._free.put(
             self._qpos[row], now.position[row, self._is_free], now.orientation[row, self._is_free]
         )
@@ -119,7 +117,7 @@ class MuJoCoSimulator:
     def _measure_now(self, row: int) -> None:
         """Fills the trace of a world with what is measured at the beginning of an episode."""
         if self._looks:
-            with _quiet():
+            with quiet():
                 self._batch.forward([row], stage=mujoco.mjtStage.mjSTAGE_VEL)
         rows = slice(row, row + 1)
         ways = Ways(*(part[rows, None] for part in self._obstacles()))
@@ -152,12 +150,12 @@ class MuJoCoSimulator:
                 [
                     controls,
                     ways.position[:, :-1].reshape(*controls.shape[:2], -1),
-                    ways.orientation[:, :-1, :, _TO_MUJOCO].reshape(*controls.shape[:2], -1),
+                    ways.orientation[:, :-1, :, TO_MUJOCO].reshape(*controls.shape[:2], -1),
                 ],
                 axis=2,
             )
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
-        with _quiet():
+        with quiet():
             self._record = self._batch.rollout(
                 self._frame_skip,
                 controls,
@@ -171,7 +169,7 @@ class MuJoCoSimulator:
         if ways is not None:
             tracks.go(ways)
             self._mocap_pos[:] = tracks.now.position
-            self._mocap_quat[:] = tracks.now.orientation[..., _TO_MUJOCO]
+            self._mocap_quat[:] = tracks.now.orientation[..., TO_MUJOCO]
         self._read(ways)
 
     def _hold_absent(self) -> None:
@@ -216,7 +214,7 @@ class MuJoCoSimulator:
             return
         if self._looks:
             # What MuJoCo records of a substep is how everything was before it.
-            with _quiet():
+            with quiet():
                 self._batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
             after = np.concatenate([record[:, 1:], self._readings[:, None]], axis=1)
         else:
@@ -264,7 +262,9 @@ class MuJoCoSimulator:
         if sensing.joints:
             trace["joint_position"] = qpos[..., self._driven[: len(self.joint_lower)]]
         if sensing.tool:
-            trace |= {name: places[name].of(after).copy() for name in ("ee_position", "ee_velocity")}
+            trace |= {
+                name: places[name].of(after).copy() for name in ("ee_position", "ee_velocity")
+            }
         if sensing.links:
             trace["link_speed"] = np.sqrt(np.square(places["links"].of(after)).sum(axis=-1))
         return trace
@@ -365,52 +365,13 @@ class MuJoCoSimulator:
 
     def pictures(self, camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
         """Returns an RGB picture of every world."""
-        raise NotImplementedError
+        if self._painter is None:
+            self._painter = Painter(build_scenery(*self._build))
+        return self._painter.paint(
+            self._qpos, self._mocap_pos, self._mocap_quat, self._goal, camera, width, height
+        )
 
     def close(self) -> None:
-        """Frees the worlds."""
-
-
-class _FreeBodies:
-    """Where bodies that physics moves are in a state.
-
-    Args:
-        model: the ``MjModel``.
-        names: their names.
-    """
-
-    def __init__(self, model, names: Sequence[str]) -> None:
-        joints = [model.joint(name).id for name in names]
-        self._position = model.jnt_qposadr[joints].reshape(-1, 1) + np.arange(7)
-        self._velocity = model.jnt_dofadr[joints].reshape(-1, 1) + np.arange(6)
-
-    def put(self, qpos: Array, position: Array, orientation: Array) -> None:
-        """Writes their poses, ``(b, 3)`` and ``(b, 4)``, into the positions of one world."""
-        qpos[self._position[:, :3]] = position
-        qpos[self._position[:, 3:]] = orientation[..., _TO_MUJOCO]
-
-    def hold(self, qpos: Array, qvel: Array, row: Array, index: Array, position: Array) -> None:
-        """Puts some of them in places, upright and at rest."""
-        qpos[row[:, None], self._position[index]] = np.hstack(
-            [position, np.tile((1.0, 0.0, 0.0, 0.0), (len(row), 1))]
-        )
-        qvel[row[:, None], self._velocity[index]] = 0
-
-    def read(self, qpos: Array, qvel: Array) -> Ways:
-        """Returns their poses and velocities, each ``(..., b, width)``."""
-        poses, moves = qpos[..., self._position], qvel[..., self._velocity]
-        orientation = poses[..., 3:][..., _TO_OURS]
-        # MuJoCo tells the angular velocity in the frame of the body.
-        return Ways(poses[..., :3], orientation, moves[..., :3], turn(orientation, moves[..., 3:]))
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps MuJoCo from writing a file of what goes wrong, which is raised as an error."""
-    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    silent.logto_file = silent.logto_console = False
-    silent.set()
-    try:
-        yield
-    finally:
-        before.set()
+        """Frees what pictures are drawn with."""
+        if self._painter is not None:
+            self._painter.close()

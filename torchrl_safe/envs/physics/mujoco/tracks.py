@@ -25,7 +25,9 @@ class Tracks:
         self._frame_skip = frame_skip
         self._ahead = frame_skip * max(1, _AHEAD // frame_skip)
         self._placements: list[Placement | None] = [None] * num_envs
-        self._limbo = np.array([(10.0 * index, 0.0, -100.0) for index in range(count)]).reshape(-1, 3)
+        self._limbo = np.array([(10.0 * index, 0.0, -100.0) for index in range(count)]).reshape(
+            -1, 3
+        )
         #: Which obstacles a world has, ``(N, m)``.
         self.present = np.zeros((num_envs, count), dtype=bool)
         #: Whether an obstacle of any world is on its way.

@@ -8,7 +8,7 @@ from torchrl_safe.envs.state import Array
 
 
 def cross(first: Array, second: Array) -> Array:
-    """Returns the cross products, ``(..., 3)``: several times as fast as NumPy's for few vectors."""
+    """Returns cross products, ``(..., 3)``: for few vectors several times as fast as NumPy's."""
     x, y, z = first[..., 0], first[..., 1], first[..., 2]
     other_x, other_y, other_z = second[..., 0], second[..., 1], second[..., 2]
     return np.stack(
