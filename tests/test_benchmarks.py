@@ -56,7 +56,7 @@ def test_parts_are_kept_and_replaced(tmp_path):
 
 def test_floor_moves_the_worlds_as_the_environment_did():
     env = ArmEnv(num_envs=2, frame_skip=3)
-    tape = Tape(2)
+    tape = Tape()
 
     def play():
         env.set_seed(0)

@@ -37,8 +37,6 @@ _RED, _YELLOW, _BLUE = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.15, 0.4,
 TOOL_MOTION = ("ee_centre", "ee_centre_velocity", "ee_angular_velocity")
 _LIMBO = (0.0, 0.0, -100.0)
 _AT_REST = (0.0, 0.0, 0.0)
-# Share of the way that a motor is behind its moving target which it makes good in a substep.
-_CATCH_UP = 0.5
 
 
 class World:
@@ -242,14 +240,16 @@ class World:
             measurements of :meth:`measure`.
         """
         client, arm = self._client, self._arm.body
-        commands = self._commands([*joint_target, *finger_target], substeps)
+        targets = [*joint_target, *finger_target]
+        # What efforts did not allow in the first half is made good in the second.
+        halfway = None if self._options.motor_gain else substeps // 2 + 1
         distances = [math.inf] * len(self._obstacles)
         forces = [0.0] * len(self._obstacles)
         measurements = []
         ways = None if self._placement.path is None else self._look_ahead(substeps)
         for substep in range(1, substeps + 1):
-            if substep <= len(commands):
-                self._command(**commands[substep - 1])
+            if substep in (1, halfway):
+                self._drive(targets, substeps + 1 - substep)
             pybullet.stepSimulation(physicsClientId=client)
             for index in self._present:
                 points = pybullet.getContactPoints(
@@ -267,32 +267,33 @@ class World:
         self._substeps += substeps
         return distances, forces, measurements
 
-    def _commands(self, targets: Vector, substeps: int) -> list[dict[str, list[float]]]:
-        """What the motors are told in the first substeps of a control step, and keep."""
+    def _drive(self, targets: Vector, remaining: int) -> None:
+        """Tells the motors how to get to their targets in the remaining substeps."""
         count, gain = len(targets), self._options.motor_gain
+        driven, options = self._driven[:count], {"physicsClientId": self._client}
+        if self._scene.motor_limits:
+            options["forces"] = self._arm.effort[:count]
         if gain is not None:
-            return [{"targetPositions": list(targets), "positionGains": [gain] * count}]
-        # A motor sets the velocity to the target's, and to what takes it a share of the way that
-        # it is behind; that of a target that moves evenly is where it is before the substep.
-        start = np.array([state[0] for state in self._joint_states()[:count]])
-        change = (targets - start) / substeps
-        follow = {
-            "targetVelocities": (change / SUBSTEP).tolist(),
-            "positionGains": [_CATCH_UP] * count,
-        }
-        ways = (start + np.arange(substeps)[:, None] * change).tolist()
-        return [{"targetPositions": way, **follow} for way in ways]
-
-    def _command(self, **motors: list[float]) -> None:
-        count = len(motors["targetPositions"])
-        limits = {"forces": self._arm.effort[:count]} if self._scene.motor_limits else {}
+            pybullet.setJointMotorControlArray(
+                self._arm.body,
+                driven,
+                pybullet.POSITION_CONTROL,
+                targetPositions=targets,
+                positionGains=[gain] * count,
+                **options,
+            )
+            return
+        # The motors keep to a velocity, in each substep, as far as their efforts allow.
+        time = SUBSTEP * remaining
+        states = pybullet.getJointStates(self._arm.body, driven, physicsClientId=self._client)
         pybullet.setJointMotorControlArray(
             self._arm.body,
-            self._driven[:count],
-            pybullet.POSITION_CONTROL,
-            physicsClientId=self._client,
-            **motors,
-            **limits,
+            driven,
+            pybullet.VELOCITY_CONTROL,
+            targetVelocities=[
+                (target - state[0]) / time for target, state in zip(targets, states, strict=True)
+            ],
+            **options,
         )
 
     def read(self, *, fresh: bool = False) -> list[float]:
