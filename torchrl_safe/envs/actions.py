@@ -17,7 +17,12 @@ from torchrl_safe.envs.state import ArmState, Array
 
 @runtime_checkable
 class ActionMode(Protocol):
-    """What :class:`~torchrl_safe.envs.ArmEnv` asks of an action representation."""
+    """What :class:`~torchrl_safe.envs.ArmEnv` asks of an action representation.
+
+    The motors' targets move evenly over the substeps of the control step, from where the joints
+    are to what :meth:`targets` returns. The joints are there at its end, where their efforts and
+    speeds allow, with every physics engine.
+    """
 
     @property
     def bound(self) -> float:
@@ -31,7 +36,14 @@ class ActionMode(Protocol):
         """Returns the number of components of an action."""
 
     def targets(self, action: Array, state: ArmState, simulator: Simulator) -> tuple[Array, Array]:
-        """Returns joint targets, rad, ``(N, n)``, and finger targets, m, ``(N, f or 0)``."""
+        """Returns joint targets, rad, ``(N, n)``, and finger targets, m, ``(N, f or 0)``.
+
+        Args:
+            action: the action, ``(N, width)``, within the bound.
+            state: the current state.
+            simulator: gives Jacobians and the home pose, see
+                :class:`~torchrl_safe.envs.Simulator`.
+        """
 
 
 @dataclass(frozen=True)
@@ -43,8 +55,8 @@ class CartesianDelta:
     that turn it, and last the one that moves the fingers.
 
     Args:
-        step: displacement that an action of 1 asks for, m. The motors do a part of it until the
-            next action: the scene's ``motor_gain``, and the speed limits of the joints.
+        step: displacement that an action of 1 asks for, m. The tool does it until the next
+            action, as far as the joints' efforts, speeds and limits allow.
         bound: largest magnitude of a component; infinity leaves actions unclipped.
         inverse_kinematics: turns tool poses into joint angles.
         orientation: tool orientation to keep, a quaternion (x, y, z, w). ``None`` keeps that of
@@ -137,8 +149,8 @@ class JointDelta:
     """Turns each joint by ``step`` radians times the action (the paper's AR2).
 
     Args:
-        step: rotation that an action of 1 asks for, rad. How much of it the motors do until the
-            next action is the scene's ``motor_gain``: by default 65 %.
+        step: rotation that an action of 1 asks for, rad. The joints do it until the next action,
+            as far as their efforts and speeds allow.
         bound: largest magnitude of a component; infinity leaves actions unclipped.
         respect_limits: never ask for an angle beyond the joint limits.
         finger_step: if given, a last component sets the free fingers' position, in metres per

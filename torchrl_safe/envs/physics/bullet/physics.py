@@ -28,9 +28,10 @@ class Bullet:
             the contact properties of the first link: a physics step takes 15 to 40 % less
             time. With ``urdf_inertia`` it is the same body; else its inertia is that of another
             box. Not done where the task moves objects, whose grip depends on these properties.
-        motor_gain: if given, the motors go this share of the way that is left to the targets in
-            each physics substep, fastest at the beginning of a control step, and do not
-            arrive. ``None`` moves the targets evenly, see :class:`~torchrl_safe.envs.ActionMode`.
+        motor_gain: if given, the motors go this share of the way that is left to their targets
+            in each physics substep, fastest at the beginning of a control step; with 1/12 and 12
+            substeps they have gone 65 % of the way at its end. ``None`` moves the targets evenly,
+            see :class:`~torchrl_safe.envs.ActionMode`.
         urdf_inertia: take inertias from the URDF instead of from the collision shapes.
         fresh_links: read the tool pose of the current joint angles. ``False`` reads it one
             physics substep late, as PyBullet does unless told otherwise.

@@ -121,6 +121,8 @@ class World:
             self_collision=sensing.itself,
         )
         self._driven = self._arm.joints + self._arm.fingers
+        unlimited = np.full(len(self._driven), np.inf)
+        self._fastest = (self._arm.speed if scene.motor_limits else unlimited).tolist()
         self._readings = Readings(
             client, self._arm, furniture, len(shapes), sensing, fresh_links=options.fresh_links
         )
@@ -286,13 +288,15 @@ class World:
         # The motors keep to a velocity, in each substep, as far as their efforts allow.
         time = SUBSTEP * remaining
         states = pybullet.getJointStates(self._arm.body, driven, physicsClientId=self._client)
+        velocities = [
+            min(max((target - state[0]) / time, -fastest), fastest)
+            for target, state, fastest in zip(targets, states, self._fastest, strict=False)
+        ]
         pybullet.setJointMotorControlArray(
             self._arm.body,
             driven,
             pybullet.VELOCITY_CONTROL,
-            targetVelocities=[
-                (target - state[0]) / time for target, state in zip(targets, states, strict=True)
-            ],
+            targetVelocities=velocities,
             **options,
         )
 
