@@ -5,7 +5,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test test-slow compare paper sweep profile gallery bench draws ray docs lint format type clean
+# What rounds differently from one processor to the next: losses, trust region, multipliers, metrics.
+NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_optimum cost_gae cost_q_critics \
+	cost_td0 family first_order functional lagrangian metrics multipliers offpolicy_optimum \
+	pid_control ppo_lagrangian sac_lagrangian trust_region trust_region_loss trust_region_optimum \
+	trust_region_step violation))
+
+.PHONY: train test test-kernels test-slow test-wheel compare paper sweep profile gallery bench draws ray \
+	docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -14,8 +21,16 @@ train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 test: $(READY)  ## everything but the slow tests, on two cores
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
 
+# The kernels that every processor has, in place of those that it is best at.
+test-kernels: $(READY)  ## the numerical tests once more, as another processor rounds
+	MKL_CBWR=COMPATIBLE ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 \
+		--dist loadfile -m "not slow" $(NUMERICAL) $(ARGS)
+
 test-slow: $(READY)  ## every combination, and the tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m slow $(ARGS)
+
+test-wheel:  ## the package as people get it: an empty environment, with and without the arms
+	PYTHON=$(PYTHON) .ci/test-wheel
 
 compare: $(READY)  ## every algorithm on the same task; goes on where it was stopped
 	$(BIN)/python -m experiments.compare $(ARGS)

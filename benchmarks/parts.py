@@ -10,8 +10,8 @@ from typing import Literal
 
 from benchmarks.report import Figure
 
-Part = Literal["env", "reset", "update", "training", "scaling"]
-PARTS: tuple[Part, ...] = ("env", "reset", "update", "training", "scaling")
+Part = Literal["env", "reset", "update", "training", "scaling", "control"]
+PARTS: tuple[Part, ...] = ("env", "reset", "update", "training", "scaling", "control")
 
 
 def measure(part: Part, *, quick: bool) -> list[Figure]:

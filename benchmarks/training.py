@@ -16,7 +16,8 @@ from torchrl import torchrl_logger
 from benchmarks.report import Figure
 from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.algorithms import ALGORITHMS
-from experiments.train import AlgorithmName, Config, collecting, make_env
+from experiments.config import AlgorithmName, Config
+from experiments.train import collecting, make_env
 from torchrl_safe.envs import PAPER_JOINT, PAPER_SETTINGS, JointDelta
 from torchrl_safe.envs.gym import ArmGymEnv
 

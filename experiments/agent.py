@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
@@ -18,6 +17,8 @@ from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
+
+Noise = Literal["same", "chosen", "none"]
 
 
 class Affine(torch.nn.Module):
@@ -35,24 +36,6 @@ class Affine(torch.nn.Module):
         return self.loc + self.scale * x
 
 
-@dataclass(frozen=True)
-class ActorSpec:
-    """The shape of a policy: with its weights, all that is needed to make it again.
-
-    Args:
-        observations: width of the observation.
-        actions: width of the action.
-        noise: whether the policy's deviation is the same in every state, chosen in each state, or
-            there is none: it then gives the action itself.
-        bounded: whether actions are between -1 and 1.
-    """
-
-    observations: int
-    actions: int
-    noise: Literal["same", "chosen", "none"]
-    bounded: bool
-
-
 class Agent(NamedTuple):
     """A policy, critics of the state, and the logarithm of the policy's deviation in all states."""
 
@@ -60,7 +43,6 @@ class Agent(NamedTuple):
     critic: ValueOperator
     cost_critic: ValueOperator
     log_std: torch.nn.Parameter
-    spec: ActorSpec
 
 
 class QAgent(NamedTuple):
@@ -69,41 +51,44 @@ class QAgent(NamedTuple):
     actor: TensorDictModuleBase
     critic: ValueOperator
     cost_critic: ValueOperator
-    spec: ActorSpec
 
 
 def make_actor(
-    spec: ActorSpec,
-    loc: Tensor | None = None,
-    scale: Tensor | None = None,
+    env: EnvBase,
+    loc: Tensor,
+    scale: Tensor,
+    *,
+    noise: Noise,
     log_std: float = 0.0,
 ) -> TensorDictModuleBase:
     """Makes a policy.
 
     Args:
-        spec: its shape.
-        loc: what is added to observations, shape ``(observations,)``; by default nothing.
-        scale: what they are multiplied by before that, the same; by default 1.
+        env: environment that it acts in.
+        loc: what is added to observations, shape ``(observations,)``.
+        scale: what they are multiplied by before that, the same.
+        noise: whether the policy's deviation is the same in every state, chosen in each state, or
+            there is none: it then gives the action itself.
         log_std: logarithm of a deviation that is the same in every state.
     """
-    loc = torch.zeros(spec.observations) if loc is None else loc
-    scale = torch.ones(spec.observations) if scale is None else scale
-    outputs = spec.actions * (2 if spec.noise == "chosen" else 1)
-    net = torch.nn.Sequential(Affine(loc, scale), _small_network(spec.observations, outputs))
-    if spec.noise == "none":
+    actions = env.action_spec.shape[-1]
+    outputs = actions * (2 if noise == "chosen" else 1)
+    net = torch.nn.Sequential(Affine(loc, scale), _small_network(len(loc), outputs))
+    if noise == "none":
         policy = torch.nn.Sequential(net, torch.nn.Tanh())
         return TensorDictModule(policy, ["observation"], ["action"])
-    if spec.noise == "chosen":
+    if noise == "chosen":
         policy = torch.nn.Sequential(net, NormalParamExtractor())
     else:
-        noise = AddStateIndependentNormalScale(spec.actions, init_value=log_std)
-        policy = torch.nn.Sequential(net, noise)
+        deviation = AddStateIndependentNormalScale(actions, init_value=log_std)
+        policy = torch.nn.Sequential(net, deviation)
+    bounded = not isinstance(env.action_spec, Unbounded)
     return ProbabilisticActor(
         TensorDictModule(policy, ["observation"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
-        distribution_class=TanhNormal if spec.bounded else IndependentNormal,
-        distribution_kwargs={"tanh_loc": False} if spec.bounded else {},
-        return_log_prob=spec.noise == "same",
+        distribution_class=TanhNormal if bounded else IndependentNormal,
+        distribution_kwargs={"tanh_loc": False} if bounded else {},
+        return_log_prob=noise == "same",
     )
 
 
@@ -121,19 +106,18 @@ def make_agent(env: EnvBase, *, gamma: float, log_std: float = 0.0) -> Agent:
         log_std: logarithm of the policy's deviation to start with.
     """
     loc, scale = _standardization(env, deviation=math.exp(log_std))
-    spec = _actor_spec(env, noise="same")
 
     def critic(outputs: int, out_key: str) -> ValueOperator:
-        net = _small_network(spec.observations, outputs)
+        net = _small_network(len(loc), outputs)
         predict = torch.nn.Sequential(
             torch.nn.Sequential(Affine(loc, scale), net), Affine(0.0, 1 / (1 - gamma))
         )
         return ValueOperator(predict, in_keys=["observation"], out_keys=[out_key])
 
-    actor = make_actor(spec, loc, scale, log_std)
+    actor = make_actor(env, loc, scale, noise="same", log_std=log_std)
     parameter = actor.get_parameter("0.module.1.state_independent_scale")
     critics = critic(1, "state_value"), critic(num_costs(env), "cost_value")
-    return Agent(actor, *critics, parameter, spec)
+    return Agent(actor, *critics, parameter)
 
 
 def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
@@ -146,17 +130,17 @@ def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
             state, or gives the action itself.
     """
     loc, scale = _standardization(env)
-    spec = _actor_spec(env, noise="chosen" if stochastic else "none")
-    actor = make_actor(spec, loc, scale)
+    actor = make_actor(env, loc, scale, noise="chosen" if stochastic else "none")
+    actions = env.action_spec.shape[-1]
 
     def critic(outputs: int, out_key: str) -> ValueOperator:
-        net = _small_network(spec.observations + spec.actions, outputs)
+        net = _small_network(len(loc) + actions, outputs)
         predict = _OfStateAndAction(Affine(loc, scale), net, Affine(0.0, 1 / (1 - gamma)))
         return ValueOperator(predict, in_keys=["observation", "action"], out_keys=[out_key])
 
     costs = num_costs(env)
     critics = critic(1, "state_action_value"), critic(costs, "state_action_cost_value")
-    return QAgent(actor, *critics, spec)
+    return QAgent(actor, *critics)
 
 
 class _OfStateAndAction(torch.nn.Module):
@@ -166,15 +150,6 @@ class _OfStateAndAction(torch.nn.Module):
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         return self.unit(self.net(self.standardize(observation), action))
-
-
-def _actor_spec(env: EnvBase, *, noise: Literal["same", "chosen", "none"]) -> ActorSpec:
-    return ActorSpec(
-        observations=env.observation_spec["observation"].shape[-1],
-        actions=env.action_spec.shape[-1],
-        noise=noise,
-        bounded=not isinstance(env.action_spec, Unbounded),
-    )
 
 
 def num_costs(env: EnvBase) -> int:

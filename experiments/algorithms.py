@@ -6,14 +6,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torchrl.data import Composite
 from torchrl.envs import CatTensors, EnvBase, Transform
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, LossModule, ValueEstimators
 
-from experiments.agent import ActorSpec, make_agent, make_q_agent, num_costs
+from experiments.agent import make_agent, make_q_agent, num_costs
+from experiments.config import Config
 from experiments.learners import Learner, NoiseSchedule, OnPolicyLearner, ReplayLearner
 from torchrl_safe.envs import EarlyTermination, Saute
 from torchrl_safe.objectives import (
@@ -38,9 +40,6 @@ from torchrl_safe.objectives import (
     ViolationUpdater,
 )
 
-if TYPE_CHECKING:
-    from experiments.train import Config
-
 Updater = MultiplierUpdater | ViolationUpdater
 # Called as rule(loss, rate, cost_limit=, pessimism=, normalize=). The gains stand to each other
 # as in tests/test_constrained_optimum.py.
@@ -58,7 +57,7 @@ class Training:
 
     Args:
         actor: the policy.
-        actor_spec: its shape.
+        observation_spec: what the policy can read.
         collector: the policy that collects, which may add noise of its own.
         loss: the loss.
         updater: what tells the loss of the batch's episode costs.
@@ -66,7 +65,7 @@ class Training:
     """
 
     actor: TensorDictModuleBase
-    actor_spec: ActorSpec
+    observation_spec: Composite
     collector: TensorDictModuleBase
     loss: LossModule
     updater: Updater | None
@@ -162,7 +161,8 @@ class OnPolicy:
             actor_step=step,
         )
         updater = self.updater(loss, config)
-        return Training(agent.actor, agent.spec, agent.actor, loss, updater, learner)
+        spec = env.observation_spec_unbatched
+        return Training(agent.actor, spec, agent.actor, loss, updater, learner)
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,8 @@ class OffPolicy:
             steps_per_update=8,
         )
         updater = self.updater(loss, config)
-        return Training(agent.actor, agent.spec, collector, loss, updater, learner)
+        observation_spec = env.observation_spec_unbatched
+        return Training(agent.actor, observation_spec, collector, loss, updater, learner)
 
 
 Algorithm = OnPolicy | OffPolicy

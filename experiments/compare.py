@@ -17,6 +17,7 @@ import torch
 import tyro
 
 from experiments import train
+from experiments.config import Action, AlgorithmName, Config as TrainConfig
 from experiments.grid import run_grid, save_results
 from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
 from torchrl_safe.metrics import worst_seed
@@ -26,15 +27,15 @@ from torchrl_safe.metrics import worst_seed
 class Config:
     """Train every algorithm and compare them."""
 
-    algorithms: tuple[train.AlgorithmName, ...] = get_args(train.AlgorithmName)
+    algorithms: tuple[AlgorithmName, ...] = get_args(AlgorithmName)
     """What to train."""
-    action: train.Action = "cartesian"
+    action: Action = "cartesian"
     """What an action moves."""
-    cost_limit: float = train.Config.cost_limit
+    cost_limit: float = TrainConfig.cost_limit
     """Limit of the expected cost of an episode."""
     seeds: int = 3
     """Runs of each algorithm, with seeds from 0."""
-    frames: int = train.Config.frames
+    frames: int = TrainConfig.frames
     """Control steps to train for."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
@@ -44,11 +45,11 @@ class Config:
     """Folder of results; runs that are already there are not run again."""
 
 
-def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]:
+def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
     """What to run, by the file of its results."""
     return {
         config.out / f"{algorithm}-{seed}.json": (
-            train.Config(
+            TrainConfig(
                 action=config.action,
                 cost_limit=config.cost_limit,
                 seed=seed,

@@ -19,16 +19,17 @@ from pathlib import Path
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from experiments import train
 from experiments.agent import num_costs
-from experiments.evaluation import evaluate, summarize
-from experiments.policy import SavedPolicy, load_policy
+from experiments.config import Config as TrainConfig
 from experiments.report import figures_table, save_animation
 from torchrl_safe.envs import ArmEnv
+from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.metrics import conditional_value_at_risk, violation_rate
+from torchrl_safe.policy import Policy, load_policy
 
 # What of a training run's configuration its environment is made of.
 _ENVIRONMENT = ("arm", "obstacles", "action", "observation", "paper", "cost_limit")
@@ -48,8 +49,8 @@ class Config:
     """Episodes to play at least, with the deterministic policy."""
     envs: int = 32
     """Worlds to play in side by side."""
-    max_steps: int | None = None
-    """Steps in which every episode ends; by default those of the arm's time limit."""
+    max_steps: int = 10_000
+    """Steps in which every episode must end."""
     seed: int = 1_000_000
     """Seed of the episodes."""
     cost_limits: tuple[float, ...] = ()
@@ -75,7 +76,7 @@ class Config:
             raise ValueError(f"gui must not be given with env, got {self.env!r}: open it there.")
 
 
-def factory(config: Config, saved: SavedPolicy) -> Callable[..., EnvBase]:
+def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
     """Returns what makes the environment, called with ``num_envs``."""
     if config.env is None:
         if "env" in saved.settings:
@@ -86,52 +87,41 @@ def factory(config: Config, saved: SavedPolicy) -> Callable[..., EnvBase]:
         known = {name: saved.settings[name] for name in _ENVIRONMENT}
         algorithm = saved.settings["name"]
         return partial(
-            train.make_env, train.Config(**known, algorithms=(algorithm,)), algorithm=algorithm
+            train.make_env, TrainConfig(**known, algorithms=(algorithm,)), algorithm=algorithm
         )
     module, _, function = config.env.partition(":")
     if not function:
         raise ValueError(f"env must be module:function, got {config.env!r}.")
     sys.path.insert(0, str(Path.cwd()))
-    return partial(_with_sums, getattr(importlib.import_module(module), function))
+    return getattr(importlib.import_module(module), function)
 
 
-def _with_sums(make_env: Callable[..., EnvBase], num_envs: int) -> EnvBase:
-    env = make_env(num_envs=num_envs)
-    if "episode_cost" in list(env.observation_spec.keys()):
-        return env
-    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
-    return env.append_transform(sums)
-
-
-def cost_limits(config: Config, saved: SavedPolicy) -> tuple[float, ...]:
+def cost_limits(config: Config, saved: Policy) -> tuple[float, ...]:
     """The limits that are given, or else those of the training."""
     if config.cost_limits or "cost_limit" not in saved.settings:
         return config.cost_limits or tuple(saved.settings.get("cost_limits", ()))
     return (saved.settings["cost_limit"],)
 
 
-def check_fit(env: EnvBase, saved: SavedPolicy, config: Config) -> None:
+def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
     """Raises ValueError unless the environment is one that can be played as it is asked for."""
-    widths = {
-        "observations": env.observation_spec["observation"].shape[-1],
-        "actions": env.action_spec.shape[-1],
+    shapes = {
+        "observations": (env.observation_spec_unbatched["observation"], saved.observation_shape),
+        "actions": (env.action_spec_unbatched, saved.action_shape),
     }
-    for name, width in widths.items():
-        if width != getattr(saved.spec, name):
+    for name, (spec, shape) in shapes.items():
+        if spec.shape != shape:
             raise ValueError(
-                f"env must have {name} of width {getattr(saved.spec, name)}, which the policy was "
-                f"trained for, got {width}."
+                f"env must have {name} of shape {shape}, which the policy was trained for, got "
+                f"{tuple(spec.shape)}."
             )
     costs, limits = num_costs(env), cost_limits(config, saved)
     if len(limits) != costs:
         raise ValueError(
             f"cost_limits must be one for each of the {costs} costs of env, got {limits}."
         )
-    if not is_arm(env):
-        if config.max_steps is None:
-            raise ValueError(f"max_steps must be given, {env} being no ArmEnv, got None.")
-        if config.video is not None:
-            raise ValueError(f"video films an ArmEnv, got {str(config.video)!r} with {env}.")
+    if config.video is not None and not is_arm(env):
+        raise ValueError(f"video films an ArmEnv, got {str(config.video)!r} with {env}.")
 
 
 def is_arm(env: EnvBase) -> bool:
@@ -140,12 +130,13 @@ def is_arm(env: EnvBase) -> bool:
 
 
 def play(
-    env: EnvBase, saved: SavedPolicy, config: Config, limits: tuple[float, ...]
+    env: EnvBase, saved: Policy, config: Config, limits: tuple[float, ...]
 ) -> dict[str, list[float]]:
     """Plays the episodes; returns their figures, each with its interval where it has one."""
-    episodes = evaluate(env, saved.actor, config.episodes, config.seed, config.max_steps)
-    costs = episodes["episode_cost"].shape[-1]
-    names = env.cost_names if is_arm(env) else tuple(map(str, range(costs)))
+    episodes = evaluate(
+        env, saved.actor, config.episodes, seed=config.seed, max_steps=config.max_steps
+    )
+    names = env.cost_names if is_arm(env) else tuple(map(str, range(num_costs(env))))
     return {**summarize(episodes, names), **safety(episodes, names, limits)}
 
 

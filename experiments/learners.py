@@ -75,6 +75,7 @@ class OnPolicyLearner:
         frames: control steps in a batch.
         minibatch: control steps in a minibatch.
         phases: what is minimized, one after the other, each with what is to be done before.
+            Defaults to ``loss``, or to its critics where ``actor_step`` moves the actor.
         actor_step: moves the actor instead of the optimizer.
     """
 
@@ -93,7 +94,7 @@ class OnPolicyLearner:
         actor_step: TrustRegionStep | None = None,
     ) -> None:
         self.loss, self.noise, self.epochs, self.actor_step = loss, noise, epochs, actor_step
-        self.phases = phases or [(None, loss)]
+        self.phases = phases or [(None, loss if actor_step is None else loss.critic_losses)]
         self.policy = list(actor.parameters())
         moved_here = {id(parameter) for parameter in self.policy}
         critics = [p for p in loss.parameters() if id(p) not in moved_here]

@@ -18,10 +18,11 @@ import numpy as np
 import tyro
 
 from experiments import train
+from experiments.config import Action, AlgorithmName, Config as TrainConfig, MultiplierRule
 from experiments.grid import run_grid, save_results
 from experiments.report import COLOURS
 
-RULES: tuple[train.MultiplierRule, ...] = ("dual-ascent", "pid")
+RULES: tuple[MultiplierRule, ...] = ("dual-ascent", "pid")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,11 +33,11 @@ class Config:
     """Fixed multipliers."""
     limits: tuple[float, ...] = (2.0, 0.5)
     """Cost limits that each multiplier rule is given."""
-    action: train.Action = "cartesian"
+    action: Action = "cartesian"
     """What an action moves."""
     seeds: int = 3
     """Runs of each, with seeds from 0."""
-    frames: int = train.Config.frames
+    frames: int = TrainConfig.frames
     """Control steps to train for."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
@@ -46,11 +47,11 @@ class Config:
     """Folder of results; runs that are already there are not run again."""
 
 
-def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]:
+def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
     """What to run, by the file of its results."""
     return {
         config.out / f"{rule}-{value:g}-{seed}.json": (
-            train.Config(
+            TrainConfig(
                 action=config.action,
                 multiplier_rule=rule,
                 multiplier_init=value if rule == "fixed" else 0.0,
@@ -68,11 +69,9 @@ def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]
     }
 
 
-def settings(config: Config) -> list[tuple[train.MultiplierRule, float]]:
+def settings(config: Config) -> list[tuple[MultiplierRule, float]]:
     """Each rule with the multiplier it keeps, or with the cost limit it is given."""
-    fixed: list[tuple[train.MultiplierRule, float]] = [
-        ("fixed", value) for value in config.multipliers
-    ]
+    fixed: list[tuple[MultiplierRule, float]] = [("fixed", value) for value in config.multipliers]
     return fixed + list(product(RULES, config.limits))
 
 

@@ -25,10 +25,10 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
-from experiments.evaluation import evaluate
 from experiments.grid import run_grid, save_results
 from experiments.report import COLOURS
 from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ActionMode, paper_env
+from torchrl_safe.evaluation import evaluate
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
 
 ACTIONS: dict[str, ActionMode] = {"AR1": PAPER_CARTESIAN, "AR2": PAPER_JOINT}

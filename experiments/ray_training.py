@@ -31,13 +31,13 @@ from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
-from experiments import train
 from experiments.algorithms import ALGORITHMS
+from experiments.config import Config as TrainConfig
 from experiments.files import is_new
 from experiments.log import Log, figures
-from experiments.policy import save_policy
 from torchrl_safe.envs import ArmEnv, Collision, Speed
 from torchrl_safe.objectives import DualAscent
+from torchrl_safe.policy import save_policy
 
 COSTS: dict[str, Any] = {"collision": Collision(), "speed": Speed(limit=0.5)}
 
@@ -60,9 +60,9 @@ class Config:
     cost_limits: tuple[float, float] = (0.5, 2.0)
     """Limits of the expected cost of an episode: control steps in which the arm collides, and in
     which the tool is faster than 0.5 m/s."""
-    frames: int = train.Config.frames
+    frames: int = TrainConfig.frames
     """Control steps to train for."""
-    frames_per_batch: int = train.Config.frames_per_batch
+    frames_per_batch: int = TrainConfig.frames_per_batch
     """Control steps between two updates of the policy."""
     seed: int = 0
     """Seed of networks and minibatches."""
@@ -152,7 +152,7 @@ def main(config: Config) -> dict[str, Any]:
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
-    settings = train.Config(
+    settings = TrainConfig(
         cost_limit=config.cost_limits[0],
         frames=config.frames,
         frames_per_batch=config.frames_per_batch,
@@ -187,8 +187,8 @@ def main(config: Config) -> dict[str, Any]:
     save_policy(
         config.out / "ppo-lagrangian" / "policy.pt",
         training.actor,
-        training.actor_spec,
-        {
+        training.observation_spec,
+        settings={
             "env": f"{make_env.__module__}:{make_env.__name__}",
             "cost_limits": list(config.cost_limits),
             "frames": config.frames,

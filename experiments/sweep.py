@@ -18,6 +18,7 @@ import torch
 import tyro
 
 from experiments import train
+from experiments.config import Action, AlgorithmName, Config as TrainConfig, Observation
 from experiments.grid import run_grid, save_results
 from experiments.report import COLOURS, episode_costs, mean_over_seeds, seeds_within, successes
 from torchrl_safe.metrics import mean, worst_seed
@@ -34,17 +35,17 @@ class Config:
     """Train in the paper's environment instead of the benchmark."""
     limits: tuple[float, ...] = (10.0, 5.0, 2.0, 1.0, 0.5)
     """Limits of the expected cost of an episode."""
-    actions: tuple[train.Action, ...] = ("cartesian", "joint")
+    actions: tuple[Action, ...] = ("cartesian", "joint")
     """What an action moves."""
-    observation: train.Observation = "full"
+    observation: Observation = "full"
     """What the policy sees."""
     seeds: int = 5
     """Runs for each limit, with seeds from 0."""
-    frames: int = train.Config.frames
+    frames: int = TrainConfig.frames
     """Control steps to train for."""
-    episode_steps: int | None = train.Config.episode_steps
+    episode_steps: int | None = TrainConfig.episode_steps
     """Control steps after which an episode to learn from is cut off."""
-    first_log_std: float = train.Config.first_log_std
+    first_log_std: float = TrainConfig.first_log_std
     """Logarithm of the policy's standard deviation at the start."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
@@ -54,11 +55,11 @@ class Config:
     """Folder of results; runs that are already there are not run again."""
 
 
-def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]:
+def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
     """What to run, by the file of its results."""
     return {
         config.out / f"{_name(action, limit, seed)}.json": (
-            train.Config(
+            TrainConfig(
                 paper=config.paper,
                 action=action,
                 observation=config.observation,
@@ -78,7 +79,7 @@ def jobs(config: Config) -> dict[Path, tuple[train.Config, train.AlgorithmName]]
     }
 
 
-def names(config: Config) -> Iterable[tuple[int, train.Action, float | None]]:
+def names(config: Config) -> Iterable[tuple[int, Action, float | None]]:
     """Seed, action and limit of each run; no limit stands for PPO."""
     return product(range(config.seeds), config.actions, (*config.limits, None))
 
@@ -149,12 +150,12 @@ def main(config: Config) -> None:
     plot(runs, config, config.out / "sweep.png")
 
 
-def _name(action: train.Action, limit: float | None, seed: int) -> str:
+def _name(action: Action, limit: float | None, seed: int) -> str:
     return f"{action}-{'none' if limit is None else f'{limit:g}'}-{seed}"
 
 
 def _select(
-    runs: list[dict[str, Any]], action: train.Action, limit: float | None
+    runs: list[dict[str, Any]], action: Action, limit: float | None
 ) -> list[dict[str, Any]]:
     return [run for run in runs if run["action"] == action and run["limit"] == limit]
 

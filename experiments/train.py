@@ -13,9 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
-from pathlib import Path
-from time import strftime
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import tyro
@@ -26,11 +24,10 @@ from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
-from experiments.algorithms import ALGORITHMS, OffPolicy, Training
-from experiments.evaluation import evaluate, summarize
+from experiments.algorithms import ALGORITHMS, Training
+from experiments.config import AlgorithmName, Config
 from experiments.files import is_new, write_whole
 from experiments.log import Log, figures, score, versions
-from experiments.policy import save_policy
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
 from torchrl_safe.collectors import ResumableCollector
@@ -53,29 +50,9 @@ from torchrl_safe.envs import (
     paper_env,
     paper_observation,
 )
+from torchrl_safe.evaluation import evaluate, summarize
+from torchrl_safe.policy import save_policy
 
-Action = Literal["cartesian", "joint"]
-Observation = Literal["full", "paper"]
-AlgorithmName = Literal[
-    "ppo",
-    "ppo-lagrangian",
-    "kl-ppo-lagrangian",
-    "a2c-lagrangian",
-    "trpo",
-    "trpo-lagrangian",
-    "cpo",
-    "pcpo",
-    "focops",
-    "cup",
-    "p3o",
-    "ipo",
-    "crpo",
-    "ppo-saute",
-    "ppo-early-termination",
-    "sac-lagrangian",
-    "td3-lagrangian",
-]
-MultiplierRule = Literal["dual-ascent", "pid", "fixed"]
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 OBSTACLES: dict[str, Obstacles] = {
     "none": NoObstacles(),
@@ -90,113 +67,6 @@ OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
 COSTS = {"collision": Collision()}
 # What may be another when a run is resumed: it changes nothing in what is learnt.
 CHANGEABLE = ("algorithms", "out", "logger", "resume", "checkpoint_every")
-
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """Train PPO and PPO-Lagrangian on a robot arm and compare them."""
-
-    arm: Literal["panda", "iiwa", "xarm6", "xarm7", "ur5", "ur10"] = "panda"
-    """Robot arm."""
-    obstacles: Literal["none", "in-front", "scattered", "moving", "human"] = "in-front"
-    """What is in the way."""
-    action: Action = "cartesian"
-    """What an action moves: the tool point, by inverse kinematics, or each joint."""
-    observation: Observation = "full"
-    """What the policy sees: all that moves, or the paper's eight numbers."""
-    paper: bool = False
-    """Train in the paper's environment: its Panda, obstacle and actions, at 240 Hz."""
-    algorithms: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
-    """What to train; ppo is PPO-Lagrangian with its multiplier fixed at 0."""
-    cost_limit: float = 0.5
-    """Limit of the expected cost of an episode: control steps in which the arm collides."""
-    frames: int = 128_000
-    """Control steps to train for, with each algorithm."""
-    envs: int = 32
-    """Simulated worlds, shared among the workers."""
-    workers: int = 2
-    """Processes that simulate; with 1 this process does. Another number gives other episodes."""
-    seed: int = 0
-    """Seed of networks, environments and minibatches."""
-    out: Path = dataclasses.field(
-        default_factory=lambda: Path("runs", strftime("%Y-%m-%d_%H-%M-%S"))
-    )
-    """Folder for logs, checkpoints, results.json and pictures; named by date and time."""
-    logger: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
-    """TorchRL logger; wandb and mlflow are to be installed by you."""
-    resume: bool = False
-    """Go on with the run in the folder where it was stopped, with the settings it has; if there
-    is none, begin it."""
-    checkpoint_every: int = 10
-    """Batches between two checkpoints: what a run that is stopped has to do again at most."""
-    eval_episodes: int = 256
-    """Episodes of the final evaluation, with the deterministic policy."""
-    frames_per_batch: int = 1024
-    """Control steps between two updates of the policy."""
-    epochs: int = 10
-    """Passes over each batch."""
-    minibatch: int = 256
-    """Control steps in a minibatch."""
-    learning_rate: float = 5e-4
-    """Adam's learning rate of the policy at the start, half that of the critics; both fall
-    linearly to 0. Off policy all networks have twice as much, and keep it."""
-    episode_steps: int | None = None
-    """Control steps after which an episode to learn from is cut off, if not at the limit of the
-    environment; evaluations always play to that."""
-    first_log_std: float = 0.0
-    """Logarithm of the policy's standard deviation at the start, before the squashing."""
-    last_log_std: float = -1.5
-    """The same at the end; it moves from one to the other linearly."""
-    gamma: float = 0.97
-    """Discount of reward and cost."""
-    multiplier_rule: MultiplierRule = "dual-ascent"
-    """What moves the multiplier: the violations added up, also the last one and its rise, or
-    nothing."""
-    multiplier_init: float = 0.0
-    """Multiplier to start with."""
-    multiplier_rate: float = 0.4
-    """Step size of the multiplier, once a batch, in units of the episode cost's standard
-    deviation; the integral gain of pid, whose other two gains are five times as large."""
-    pessimism: float = 2.0
-    """Standard errors added to the mean cost of a batch before it is compared with the limit; p3o,
-    ipo and crpo do without."""
-
-    def __post_init__(self) -> None:
-        counts = ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs")
-        for name in (*counts, "minibatch", "checkpoint_every", "episode_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}.")
-        for name in ("first_log_std", "last_log_std"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"{name} must be finite, got {getattr(self, name)}.")
-        for name in ("learning_rate", "multiplier_rate"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
-        for name in ("cost_limit", "multiplier_init", "pessimism"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
-        if not 0 < self.gamma < 1:
-            raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
-        if not self.algorithms:
-            raise ValueError("algorithms must name at least one algorithm, got none.")
-        if self.paper and (self.arm, self.obstacles) != (Config.arm, Config.obstacles):
-            raise ValueError(
-                f"paper has an arm and an obstacle of its own, got {self.arm} and {self.obstacles}."
-            )
-        for name in self.algorithms:
-            if self.paper and isinstance(ALGORITHMS[name], OffPolicy):
-                raise ValueError(
-                    f"algorithms must not contain {name} with paper: it needs bounded actions."
-                )
-            if name == "ppo-saute" and not self.cost_limit:
-                raise ValueError("cost_limit must be positive with ppo-saute, got 0.")
-        for name, divisor in (("envs", "workers"), ("frames_per_batch", "envs")):
-            if getattr(self, name) % getattr(self, divisor):
-                raise ValueError(
-                    f"{name} must be a multiple of {divisor}, got {getattr(self, name)} and "
-                    f"{getattr(self, divisor)}."
-                )
 
 
 def make_env(
@@ -330,7 +200,12 @@ def train(
 def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) -> None:
     """Writes the policy to a file of its own, with what it was trained for."""
     trained = {**json.loads(json.dumps(dataclasses.asdict(config), default=str)), "name": algorithm}
-    save_policy(config.out / algorithm / "policy.pt", training.actor, training.actor_spec, trained)
+    save_policy(
+        config.out / algorithm / "policy.pt",
+        training.actor,
+        training.observation_spec,
+        settings=trained,
+    )
 
 
 def train_and_evaluate(

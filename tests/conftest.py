@@ -1,6 +1,7 @@
 """Fixtures shared by the tests."""
 
 import pytest
+import torch
 from worlds import turntable_settings
 
 
@@ -24,3 +25,9 @@ def make_env():
 def turntable(tmp_path):
     """Settings of an ArmEnv with a bar that turns about a vertical axis."""
     return turntable_settings(tmp_path)
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    """Numbers that a test draws do not depend on the tests before it."""
+    torch.manual_seed(0)

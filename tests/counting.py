@@ -28,7 +28,7 @@ class Counting(gymnasium.Env):
         self.steps = steps
 
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
+        gymnasium.Env.reset(self, seed=seed)
         self.count = 0
         # Costs at a reset belong to no step: nobody may read them.
         return np.zeros(1, np.float32), {"cost": -99.0}
@@ -60,7 +60,17 @@ class Forgetful(Counting):
         return {} if self.count == 2 else super().info()
 
 
-for kind in (Counting, SixTuple, Forgetful):
+class WithoutConstructor(gymnasium.Env):
+    """Counts to four, without an ``__init__`` of its own."""
+
+    metadata = Counting.metadata
+    observation_space = Counting.observation_space
+    action_space = Counting.action_space
+    steps = 4
+    reset, info, step = Counting.reset, Counting.info, Counting.step
+
+
+for kind in (Counting, SixTuple, Forgetful, WithoutConstructor):
     gymnasium.register(f"{kind.__name__}-v0", entry_point=f"{__name__}:{kind.__name__}")
 
 

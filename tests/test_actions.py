@@ -147,7 +147,7 @@ def test_joints_keep_to_the_speeds_of_the_urdf(make_env, action):
             actions = torch.randn(env.action_spec.shape, generator=generator).sign()
             env.step(TensorDict({"action": actions}, batch_size=[8]))
             speeds.append(np.abs(env.arm_state.joint_velocity) / limit)
-    assert 0.5 < np.percentile(speeds, 90)
+    assert np.percentile(speeds, 90) > 0.5
     assert np.percentile(speeds, 98.5) < 1.05
 
 

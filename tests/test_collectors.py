@@ -5,10 +5,13 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import ParallelEnv, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
+from torchrl.modules import ProbabilisticActor, TanhNormal
 
+from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import ArmEnv, Collision
 
 
@@ -113,3 +116,60 @@ def make_env_spec():
     spec = env.action_spec
     env.close()
     return spec
+
+
+def resumable(device="cpu"):
+    """A collector whose policy draws from the generator of its device."""
+    policy = ProbabilisticActor(
+        TensorDictModule(
+            torch.nn.Sequential(torch.nn.Linear(40, 6), NormalParamExtractor()),
+            ["observation"],
+            ["loc", "scale"],
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+    )
+    return ResumableCollector(
+        make_env(2, seed=0),
+        policy.to(device),
+        policy_device=device,
+        env_device="cpu",
+        storing_device="cpu",
+        frames_per_batch=24,
+        total_frames=-1,
+        auto_register_policy_transforms=False,
+    )
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_resuming_a_policy_on_cuda():
+    one, other = resumable("cuda"), resumable("cuda")
+    try:
+        next(iter(one))
+        state = one.state_dict()
+        expected = next(iter(one)).clone()
+        other.load_state_dict(state)
+        assert torch.equal(next(iter(other))["action"], expected["action"])
+    finally:
+        one.shutdown()
+        other.shutdown()
+
+
+@pytest.mark.parametrize("devices", [0, 1, 2, 3])
+def test_generators_of_every_cuda_device_are_saved(devices, monkeypatch):
+    """Here without one: what is asked of torch.cuda, for a state that has seen two devices."""
+    states = [torch.full((16,), index, dtype=torch.uint8) for index in (1, 2)]
+    loaded = []
+    collector = resumable()
+    try:
+        assert "cuda_generators" not in collector.state_dict()
+        with monkeypatch.context() as patch:
+            patch.setattr(torch.cuda, "is_initialized", lambda: True)
+            patch.setattr(torch.cuda, "get_rng_state_all", lambda: states)
+            state = collector.state_dict()
+        monkeypatch.setattr(torch.cuda, "device_count", lambda: devices)
+        monkeypatch.setattr(torch.cuda, "set_rng_state_all", loaded.extend)
+        collector.load_state_dict(state)
+    finally:
+        collector.shutdown()
+    assert [int(generator[0]) for generator in loaded] == [1, 2][:devices]

@@ -24,12 +24,13 @@ import math
 from functools import partial
 
 import pytest
-from cmdp import LIMIT, train
 
 from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss
+from torchrl_safe.testing import ConstrainedBandit, train_on_bandit
 
-make_loss = partial(PPOLagrangianLoss, num_costs=2, entropy_bonus=False)
-train_ppo = partial(train, make_loss=make_loss, read=lambda loss: loss.lagrange_multiplier)
+LIMIT = ConstrainedBandit.optimal_probability
+
+train_ppo = partial(train_on_bandit, partial(PPOLagrangianLoss, entropy_bonus=False))
 
 RULES = {
     "dual-ascent": partial(DualAscent, lr=1.0),
@@ -39,7 +40,7 @@ RULES = {
 
 @pytest.fixture(scope="module")
 def trained():
-    return {name: train_ppo(seed=0, rule=rule, batches=240) for name, rule in RULES.items()}
+    return {name: train_ppo(rule, num_batches=240) for name, rule in RULES.items()}
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -71,6 +72,6 @@ def test_pid_control_damps_the_circling(trained):
 
 
 def test_without_the_multiplier_the_limit_is_exceeded():
-    shares, multipliers = train_ppo(seed=0, rule=None, batches=60)
+    shares, multipliers = train_ppo(None, num_batches=60)
     assert shares[-20:].mean() > 0.95
     assert (multipliers == 0).all()

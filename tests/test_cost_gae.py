@@ -4,10 +4,12 @@ import re
 
 import pytest
 import torch
-from networks import make_batch, make_critic
 from tensordict import TensorDict
+from torchrl.data import MultiStep
+from torchrl.objectives.value import MultiAgentGAE
 
 from torchrl_safe.objectives import CostGAE
+from torchrl_safe.testing import make_batch, make_critic
 
 GAMMA, LMBDA = 0.9, 0.7
 
@@ -221,3 +223,99 @@ def test_dispatch_equals_the_tensordict_call(num_costs):
     expected = make_gae(critic)(batch)
     torch.testing.assert_close(advantage, expected["cost_advantage"])
     torch.testing.assert_close(target, expected["cost_value_target"])
+
+
+# ---------------------------------------------------------------- several agents
+
+
+def of_agents(shape=(4, 4), agents=4, num_costs=2):
+    """A batch of per-agent values and costs; done, shared, as a flag of the team."""
+    torch.manual_seed(0)
+    done = torch.rand(*shape, 1) < 0.3
+    sizes = (*shape, agents, num_costs)
+    return TensorDict(
+        cost_value=torch.randn(sizes),
+        next=TensorDict(
+            cost=torch.rand(sizes),
+            cost_value=torch.randn(sizes),
+            done=done,
+            terminated=done & (torch.rand(*shape, 1) < 0.5),
+            batch_size=shape,
+        ),
+        batch_size=shape,
+    )
+
+
+def of_one_agent(batch, agent):
+    """What one of them sees, without the axis of the agents."""
+    one = batch.clone()
+    for key in ("cost_value", ("next", "cost"), ("next", "cost_value")):
+        one[key] = batch[key][..., agent, :]
+    return one
+
+
+@pytest.mark.parametrize("vectorized", [True, False], ids=["vectorized", "loop"])
+@pytest.mark.parametrize("agents", [1, 3, 4])
+def test_agents_that_share_a_done_signal(agents, vectorized):
+    """Each as if alone. With as many agents as rows and steps, done fits along a wrong axis too."""
+    batch = of_agents(agents=agents)
+    got = make_gae(average_gae=False, vectorized=vectorized)(batch.clone())
+    for agent in range(agents):
+        expected = recursion(of_one_agent(batch, agent))
+        torch.testing.assert_close(got["cost_advantage"][..., agent, :], expected)
+
+
+def test_agents_as_in_torchrl():
+    """A cost of one column is what MultiAgentGAE makes of a reward."""
+    batch = of_agents(num_costs=1)
+    peer = MultiAgentGAE(gamma=GAMMA, lmbda=LMBDA, value_network=None)
+    peer.set_keys(value="cost_value", reward="cost")
+    shared = batch.clone()
+    shared["next", "cost"] = batch["next", "cost"][..., 0, :]
+    for data in (batch, shared):
+        expected = peer(data.clone())["advantage"]
+        torch.testing.assert_close(make_gae(average_gae=False)(data)["cost_advantage"], expected)
+
+
+@pytest.mark.parametrize("shared_cost", [True, False])
+def test_a_signal_of_each_agent_is_that_of_all(shared_cost):
+    batch = of_agents(agents=3)
+    if shared_cost:
+        batch["next", "cost"] = batch["next", "cost"][..., :1, :].expand(4, 4, 3, 2)
+    apart = batch.clone()
+    for key in ("done", "terminated"):
+        apart["next", key] = batch["next", key][..., None, :].expand(4, 4, 3, 1)
+    if shared_cost:
+        batch["next", "cost"] = batch["next", "cost"][..., 0, :]
+    one, two = make_gae()(batch), make_gae()(apart)
+    torch.testing.assert_close(one["cost_advantage"], two["cost_advantage"], rtol=0, atol=0)
+    centre = one["cost_advantage"].mean((0, 1, 2))
+    torch.testing.assert_close(centre, torch.zeros(2), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("key", "shape", "message"),
+    [
+        ("done", (4, 4), r"'done' must have the shape \(4, 4, 1\), or \(4, 1\) if agents share it"),
+        ("done", (4, 4, 2, 1), r"'done' must have the shape .* got \(4, 4, 2, 1\)"),
+        ("terminated", (4, 4, 3), r"'terminated' must have the shape .* got \(4, 4, 3\)"),
+        ("cost", (4, 4), r"one column for each constraint, got shapes \(4, 4\) and \(4, 4, 4\)"),
+    ],
+)
+def test_a_signal_that_fits_no_axis_is_refused(key, shape, message):
+    batch = of_agents(agents=1, num_costs=4)
+    batch = of_one_agent(batch, 0)
+    batch["next", key] = torch.zeros(shape, dtype=batch["next", key].dtype)
+    with pytest.raises(ValueError, match=message):
+        make_gae()(batch)
+
+
+@pytest.mark.parametrize("num_costs", [1, 2])
+def test_sums_of_several_steps_are_refused(num_costs):
+    """TorchRL's GAE adds them up once more; with several costs it names neither key nor reason."""
+    postproc = MultiStep(gamma=GAMMA, n_steps=2)
+    postproc.reward_keys = ("reward", "cost")
+    batch = postproc(with_values(num_costs))
+    for call in (make_gae(), make_gae().value_estimate):
+        with pytest.raises(ValueError, match="'steps_to_next_obs' is in the batch, which a multi"):
+            call(batch)

@@ -3,6 +3,9 @@ cost critics' targets, the mixed objective, keys, states and how they plug in.""
 
 import copy
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,9 +14,7 @@ from off_policy import (
     PARENTS,
     call,
     make_actor,
-    make_batch,
     make_cost_critic,
-    make_critic,
     make_loss,
     make_parent,
     networks,
@@ -33,6 +34,7 @@ from torchrl_safe.objectives import (
     SACLagrangianLoss,
     TD3LagrangianLoss,
 )
+from torchrl_safe.testing import make_q_critic, make_q_networks, make_transitions
 
 each_loss = pytest.mark.parametrize(
     "kind", [SACLagrangianLoss, TD3LagrangianLoss], ids=["sac", "td3"]
@@ -94,16 +96,16 @@ def assert_same_outputs(actual, expected):
 @pytest.mark.parametrize(("kind", "options"), CASES)
 def test_multiplier_zero_is_the_parent_bit_for_bit(kind, options, num_costs):
     loss, parent = make_loss(kind, num_costs, **options), make_parent(kind, **options)
-    ours, theirs = make_batch(num_costs), make_batch(num_costs)
+    ours, theirs = make_transitions(num_costs), make_transitions(num_costs)
     expected = call(parent, theirs)
     random_state = torch.get_rng_state()
     losses = call(loss, ours)
     assert torch.equal(torch.get_rng_state(), random_state)
     assert_same_outputs(losses, expected)
     # The priority is written into the batch, and nothing else (SACLoss leaves more behind).
-    assert set(ours.keys(True)) == {*make_batch().keys(True), "td_error"}
+    assert set(ours.keys(True)) == {*make_transitions().keys(True), "td_error"}
     assert torch.equal(ours["td_error"], theirs["td_error"])
-    assert (ours.exclude("td_error") == make_batch(num_costs)).all()
+    assert (ours.exclude("td_error") == make_transitions(num_costs)).all()
     assert expected["loss_actor"].abs().min() > 0
     extra = {"loss_cost_qvalue"}
     if options.get("scalar_output_mode") != "exclude":
@@ -118,7 +120,7 @@ def test_multiplier_zero_is_the_parent_bit_for_bit(kind, options, num_costs):
 def test_multiplier_zero_trains_like_the_parent_bit_for_bit(kind, options):
     loss, parent = make_loss(kind, 2, **options), make_parent(kind, **options)
     start = [p.detach().clone() for p in parameters(loss, "cost_qvalue")]
-    data = make_batch(2, rows=32)
+    data = make_transitions(2, num_transitions=32)
     for trained in (loss, parent):
         torch.manual_seed(3)
         optimizer = torch.optim.Adam(trained.parameters(), lr=1e-2)
@@ -160,7 +162,7 @@ def test_targets_by_hand(kind):
     target_values = torch.tensor([[10.0, 0.0], [4.0, 6.0]])
     loss = make_constant(make_loss(kind, 2, loss_function="l2"), values, target_values)
     loss.make_cost_value_estimator(gamma=0.5)
-    batch = make_batch(2, rows=3)  # Goes on, terminates, is truncated.
+    batch = make_transitions(2, num_transitions=3)  # Goes on, terminates, is truncated.
     batch["next", "cost"] = torch.tensor([[1.0, 2.0], [1.0, 2.0], [3.0, 0.0]])
     # 0.5 max(10, 4) = 5 and 0.5 max(0, 6) = 3 follow, except at the end.
     targets = torch.tensor([[6.0, 5.0], [1.0, 2.0], [8.0, 3.0]])
@@ -179,7 +181,7 @@ def test_critics_and_targets_settle_at_the_discounted_cost(kind):
     loss = make_constant(
         make_loss(kind, 3, loss_function="l2"), torch.zeros(2, 3), torch.zeros(2, 3)
     ).make_cost_value_estimator(gamma=0.5)
-    batch = make_batch(3, rows=1).expand(8).clone()
+    batch = make_transitions(3, num_transitions=1).expand(8).clone()
     batch["next", "observation"] = batch["observation"].clone()
     batch["next", "cost"] = torch.tensor([1.0, 2.0, 0.0]).expand(8, 3)
     bias = loss.cost_qvalue_network_params["module", "body", "2", "bias"]
@@ -211,7 +213,7 @@ def test_next_costs_are_those_of_the_action_that_the_reward_is_bootstrapped_with
             for cost, reward in pairs:  # One critic twice: the largest is the smallest.
                 reward.data.copy_(reward.data[:1].expand_as(reward.data).clone())
                 cost.data.copy_(reward.data)
-    batch = make_batch(1)
+    batch = make_transitions(1)
     batch["next", "cost"] = batch["next", "reward"].clone()
     losses = loss(batch)
     torch.testing.assert_close(losses["loss_cost_qvalue"], losses["loss_qvalue"])
@@ -225,7 +227,7 @@ NO_ENTROPY = {SACLagrangianLoss: {"fixed_alpha": True, "alpha_init": 1e-12}, TD3
 
 @each_loss
 def test_discount_of_the_costs_acts_on_the_costs_alone(kind):
-    loss, batch = make_loss(kind, 2), make_batch(2)
+    loss, batch = make_loss(kind, 2), make_transitions(2)
     before = call(loss, batch)
     assert loss.cost_value_estimator.gamma.item() == pytest.approx(0.99)
     loss.make_cost_value_estimator(gamma=0.5)
@@ -257,7 +259,7 @@ def test_the_loss_is_the_sum_over_ensemble_and_costs(kind):
     whole = make_loss(kind, 3, num_cost_qvalue_nets=2, reduction="sum", **NO_ENTROPY[kind])
     values = torch.tensor([[0.0, 1.0, 2.0], [2.0, 3.0, -1.0]])
     make_constant(whole, values, torch.zeros(2, 3))
-    batch = make_batch(3)
+    batch = make_transitions(3)
     cost = batch["next", "cost"]
     errors = [smooth_l1_loss(critic.expand_as(cost), cost, reduction="sum") for critic in values]
     torch.testing.assert_close(whole(batch)["loss_cost_qvalue"], sum(errors))
@@ -265,7 +267,7 @@ def test_the_loss_is_the_sum_over_ensemble_and_costs(kind):
 
 @each_loss
 def test_weights_and_masks_act_on_the_cost_critics(kind):
-    loss, batch = make_loss(kind, 2, **NO_ENTROPY[kind]), make_batch(2)
+    loss, batch = make_loss(kind, 2, **NO_ENTROPY[kind]), make_transitions(2)
     make_constant(loss, torch.ones(2, 2), torch.zeros(2, 2))
     error = 2 * smooth_l1_loss(torch.ones(12, 2), batch["next", "cost"], reduction="none").sum(-1)
     torch.testing.assert_close(loss(batch)["loss_cost_qvalue"], error.mean())
@@ -284,7 +286,7 @@ def test_weights_and_masks_act_on_the_cost_critics(kind):
 @each_loss
 def test_a_very_large_multiplier_minimizes_its_cost(kind):
     """Constant but for the bias, two critics: the actor follows the larger prediction."""
-    loss, batch = make_loss(kind, 3), make_batch(3)
+    loss, batch = make_loss(kind, 3), make_transitions(3)
     loss.lagrange_multiplier[1] = 1e8
     call(loss, batch)["loss_actor"].backward()
     ours = torch.cat([p.grad.flatten() for p in parameters(loss, "actor")])
@@ -316,7 +318,7 @@ def test_the_objective_by_hand(kind):
         torch.tensor([[1.0, 0.0], [3.0, -4.0]]),
         torch.zeros(2, 2),
     )
-    batch = make_batch(2)
+    batch = make_transitions(2)
     without = call(make_parent(kind), batch)["loss_actor"]
     # The largest predictions are 3 and 0; the entropy of SAC is divided with the rest.
     expected = (without + 0.5 * 3 + 2.0 * 0) / (1 + 0.5 + 2.0)
@@ -327,7 +329,7 @@ def test_the_objective_by_hand(kind):
 @each_loss
 def test_each_loss_trains_one_network(kind, name):
     loss = make_loss(kind, 2, multiplier_init=0.7)
-    losses = loss(make_batch(2))
+    losses = loss(make_transitions(2))
     extra = {"loss_alpha"} & set(loss.out_keys)
     assert {key for key, value in losses.items() if value.requires_grad} == {*TRAINS, *extra}
     losses[name].backward()
@@ -337,7 +339,7 @@ def test_each_loss_trains_one_network(kind, name):
 @pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
 @each_loss
 def test_separate_losses_freeze_what_the_cost_critics_share_with_the_actor(kind, separate):
-    actor, critic = make_actor(kind), make_critic()
+    actor, critic = make_actor(kind), make_q_critic()
     shared = next(module for module in actor.modules() if isinstance(module, nn.Linear))
     encoder = TensorDictModule(shared, ["observation"], ["hidden"])
     head = nn.Linear(shared.out_features, 2)
@@ -350,7 +352,7 @@ def test_separate_losses_freeze_what_the_cost_critics_share_with_the_actor(kind,
     assert params["1", "module", "weight"].requires_grad
     # Frozen, the ensemble reads what the actor has; else each member has a layer of its own.
     assert torch.equal(params["0", "module", "weight"][0], shared.weight) == separate
-    loss(make_batch(2))["loss_cost_qvalue"].backward()
+    loss(make_transitions(2))["loss_cost_qvalue"].backward()
     assert params["1", "module", "weight"].grad.abs().sum() > 0
     assert all(p.grad is None for p in parameters(loss, "actor"))
 
@@ -383,7 +385,7 @@ def test_ensemble_members_differ_and_can_be_given(kind):
     assert not torch.equal(first, second)
     assert not torch.equal(second, third)
     members = [make_cost_critic(2) for _ in range(2)]
-    given = kind(make_actor(kind), make_critic(), members, num_costs=2, **OWN[kind])
+    given = kind(make_actor(kind), make_q_critic(), members, num_costs=2, **OWN[kind])
     weights = given.cost_qvalue_network_params["module", "body", "0", "weight"]
     for index, member in enumerate(members):
         assert torch.equal(weights[index], member.module.body[0].weight)
@@ -405,7 +407,7 @@ def test_every_rule_moves_the_multipliers(kind, rule):
     updater.step(torch.tensor([[2.0, 0.0], [4.0, 0.0]]))
     assert loss.lagrange_multiplier.tolist() == [1.0, 0.0]
     updater.step(torch.empty(0, 2))
-    losses = loss(make_batch(2))
+    losses = loss(make_transitions(2))
     assert (losses["lagrange_multiplier_0"], losses["lagrange_multiplier_1"]) == (1.0, 0.0)
 
 
@@ -436,7 +438,7 @@ def test_the_multiplier_is_a_buffer_and_no_parameter(kind):
     loss = make_loss(kind, 2, multiplier_init=1.5)
     assert not any("multiplier" in name for name, _ in loss.named_parameters())
     optimizer = torch.optim.Adam(loss.parameters(), lr=1.0)
-    losses = loss(make_batch(2))
+    losses = loss(make_transitions(2))
     sum(losses[key] for key in trained_losses(loss)).backward()
     optimizer.step()
     assert loss.lagrange_multiplier.tolist() == [1.5, 1.5]
@@ -453,7 +455,7 @@ def test_the_multiplier_is_a_buffer_and_no_parameter(kind):
 @each_loss
 def test_a_batch_without_cost_is_refused(kind):
     with pytest.raises(KeyError, match=r"\('next', 'cost'\)"):
-        make_loss(kind)(make_batch().exclude(("next", "cost")))
+        make_loss(kind)(make_transitions().exclude(("next", "cost")))
 
 
 @each_loss
@@ -461,25 +463,25 @@ def test_costs_of_the_wrong_width_are_refused(kind):
     with pytest.raises(
         ValueError, match=r"\('next', 'cost'\) must have shape \(12, 2\).*\(12, 3\)"
     ):
-        make_loss(kind, 2)(make_batch(3))
+        make_loss(kind, 2)(make_transitions(3))
 
 
 @each_loss
 def test_cost_critics_of_the_wrong_width_are_refused(kind):
-    loss = kind(make_actor(kind), make_critic(), make_cost_critic(3), num_costs=2, **OWN[kind])
+    loss = kind(make_actor(kind), make_q_critic(), make_cost_critic(3), num_costs=2, **OWN[kind])
     SoftUpdate(loss, tau=0.5)
     message = r"cost_qvalue_network must write .* of shape \(12, 2\).* got \(12, 3\)"
     with pytest.raises(ValueError, match=message):
-        loss(make_batch(2))
+        loss(make_transitions(2))
 
 
 @each_loss
 def test_cost_critics_that_write_another_key_are_refused(kind):
     critic = make_cost_critic(1, key="elsewhere")
-    loss = kind(make_actor(kind), make_critic(), critic, **OWN[kind])
+    loss = kind(make_actor(kind), make_q_critic(), critic, **OWN[kind])
     SoftUpdate(loss, tau=0.5)
     with pytest.raises(KeyError, match="does not write the key 'state_action_cost_value'"):
-        loss(make_batch())
+        loss(make_transitions())
 
 
 @pytest.mark.parametrize("shape", [(1,), (3,), (2, 1)], ids=str)
@@ -498,7 +500,7 @@ def test_multiplier_init_must_be_finite_and_not_negative(kind, init):
 
 @each_loss
 def test_there_is_at_least_one_of_each(kind):
-    actor, critic, cost_critic = make_actor(kind), make_critic(), make_cost_critic()
+    actor, critic, cost_critic = make_actor(kind), make_q_critic(), make_cost_critic()
     with pytest.raises(ValueError, match="num_costs must be a whole number of at least 1, got 0"):
         kind(actor, critic, cost_critic, num_costs=0, **OWN[kind])
     with pytest.raises(
@@ -522,18 +524,15 @@ VALUE_KEYS = {
 
 def run_with_keys(kind, keys):
     torch.manual_seed(0)
-    names = {**BATCH_KEYS, **VALUE_KEYS, "action": "action", "priority": "td_error", **keys}
     loss = kind(
-        make_actor(kind, names["action"]),
-        make_critic(1, names["state_action_value"], names["action"]),
-        make_cost_critic(2, names["state_action_cost_value"], names["action"]),
+        *make_q_networks(2, keys=keys, deterministic=kind is TD3LagrangianLoss),
         num_costs=2,
         multiplier_init=0.7,
         **OWN[kind],
     )
     SoftUpdate(loss, tau=0.5)
     loss.set_keys(**keys)
-    batch = make_batch(2)
+    batch = make_transitions(2)
     for key in BATCH_KEYS.keys() & keys.keys():
         batch["next"].rename_key_(key, keys[key])
     if "action" in keys:
@@ -562,7 +561,7 @@ def test_all_keys_can_be_nested_at_once(kind):
 
 @each_loss
 def test_default_keys_and_back(kind):
-    loss, batch = make_loss(kind, 2), make_batch(2)
+    loss, batch = make_loss(kind, 2), make_transitions(2)
     loss(batch)  # Estimators exist from here on.
     keys = {"cost": "cost", "state_action_cost_value": "state_action_cost_value"}
     for key, default in keys.items():
@@ -594,7 +593,7 @@ def by_keyword(loss, batch):
 
 @each_loss
 def test_call_with_keywords_equals_call_with_tensordict(kind):
-    loss, batch = make_loss(kind, 2, multiplier_init=0.7), make_batch(2)
+    loss, batch = make_loss(kind, 2, multiplier_init=0.7), make_transitions(2)
     expected = call(loss, batch)
     assert set(loss.out_keys) == set(expected.keys())
     torch.manual_seed(7)
@@ -609,6 +608,27 @@ def test_call_with_keywords_equals_call_with_tensordict(kind):
 
 
 @each_loss
+def test_outputs_can_be_selected_before_torchrl_has_built_the_parent(kind):
+    """TorchRL makes a property of a class's list of outputs when that class itself is built."""
+    code = (
+        "from off_policy import *\n"
+        f"loss = make_loss({kind.__name__}, 2)\n"
+        "print(*loss.select_out_keys('loss_actor', 'loss_cost_qvalue').out_keys)\n"
+        "print(*sorted(loss(make_batch(2)).keys()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["loss_actor loss_cost_qvalue"] * 2
+
+
+@each_loss
 def test_a_critic_may_read_what_the_actor_does_not(kind):
     class Privileged(nn.Linear):
         def forward(self, observation, state, action):
@@ -616,10 +636,10 @@ def test_a_critic_may_read_what_the_actor_does_not(kind):
 
     critic = make_cost_critic()
     critic.module, critic.in_keys = Privileged(4 + 1 + 2, 1), ["observation", "state", "action"]
-    loss = kind(make_actor(kind), make_critic(), critic, **OWN[kind])
+    loss = kind(make_actor(kind), make_q_critic(), critic, **OWN[kind])
     SoftUpdate(loss, tau=0.5)
     assert {"state", ("next", "state")} <= set(loss.in_keys)
-    batch = make_batch()
+    batch = make_transitions()
     batch["state"] = torch.randn(12, 1)
     batch["next", "state"] = torch.randn(12, 1)
     expected = call(loss, batch)["loss_cost_qvalue"]
@@ -635,7 +655,7 @@ def test_a_critic_may_read_what_the_actor_does_not(kind):
 def test_state_goes_between_a_fresh_and_a_used_loss(kind, used):
     saved, loaded = make_loss(kind, 2, multiplier_init=1.5), make_loss(kind, 2, seed=5)
     saved.make_cost_value_estimator(gamma=0.5)
-    batch = make_batch(2)
+    batch = make_transitions(2)
     if used != "neither":
         {"saved": saved, "loaded": loaded}[used](batch)
     assert loaded.load_state_dict(saved.state_dict(), strict=True)
@@ -646,7 +666,7 @@ def test_state_goes_between_a_fresh_and_a_used_loss(kind, used):
 
 @each_loss
 def test_cast_to_double(kind):
-    loss, batch = make_loss(kind, 2, multiplier_init=0.7), make_batch(2)
+    loss, batch = make_loss(kind, 2, multiplier_init=0.7), make_transitions(2)
     loss(batch)
     loss.to(torch.float64)
     assert loss.lagrange_multiplier.dtype == torch.float64
@@ -658,7 +678,7 @@ def test_cast_to_double(kind):
 
 @each_loss
 def test_a_copy_is_independent(kind):
-    loss, batch = make_loss(kind, 2), make_batch(2)
+    loss, batch = make_loss(kind, 2), make_transitions(2)
     loss(batch)
     twin = copy.deepcopy(loss)
     assert_same_outputs(call(twin, batch), call(loss, batch))
@@ -680,7 +700,7 @@ def test_reset_reinitializes_the_cost_critics(kind):
 
 @each_loss
 def test_batch_of_rows_and_time_equals_the_flat_one(kind):
-    loss, flat = make_loss(kind, 2, multiplier_init=0.7), make_batch(2)
+    loss, flat = make_loss(kind, 2, multiplier_init=0.7), make_transitions(2)
     rows = flat.reshape(3, 4)
     losses, expected = call(loss, rows), call(loss, flat)
     for key in TRAINS:
@@ -710,7 +730,7 @@ def test_compiles_to_one_graph_that_sees_the_multiplier_move(kind):
         return graph.forward
 
     torch._dynamo.reset()
-    loss, batch = make_loss(kind, 2, multiplier_init=0.5), make_batch(2)
+    loss, batch = make_loss(kind, 2, multiplier_init=0.5), make_transitions(2)
     expected = call(loss, batch)
     compiled = torch.compile(loss, fullgraph=True, backend=eager)
     first = call(compiled, batch.clone())

@@ -4,6 +4,7 @@ import math
 import re
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,9 @@ from torchrl_safe.envs import ArmEnv, NoObstacles
 ROOT = Path(__file__).parent.parent
 
 
-def run(path, folder=None):
+def run(path, folder=None, options=()):
     done = subprocess.run(
-        [sys.executable, str(path)],
+        [sys.executable, *options, str(path)],
         capture_output=True,
         text=True,
         timeout=240,
@@ -34,15 +35,33 @@ def code_of(document, language="python"):
     return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
+# Drives the arm with what the loop has saved; the next process knows nothing else of it.
+DRIVE = """
+from torchrl_safe.envs import PANDA, ArmEnv
+
+env = ArmEnv(PANDA, seed=1)
+tensordict = env.reset()
+for _ in range(5):
+    action = policy(tensordict["observation"][0].numpy())
+    tensordict["action"] = torch.from_numpy(action)[None]
+    tensordict = env.step(tensordict)["next"]
+    print("moved by", abs(action).max())
+print(action.shape)
+"""
+
+
 def test_readme_loop(tmp_path):
-    code = code_of("README.md")[0]
-    assert len(code.splitlines()) <= 40
+    loop, use = code_of("README.md")[:2]
+    assert len(loop.splitlines()) <= 40
     # The same program on fewer frames.
-    short = code.replace("total_frames=256_000", "total_frames=4_096")
-    assert short != code
+    short = loop.replace("total_frames=256_000", "total_frames=4_096")
+    assert short != loop
     script = tmp_path / "readme.py"
     script.write_text(short, encoding="utf-8")
-    lines = re.findall(r"cost \[(\S+)\] multiplier \[(\S+)\]", run(script))
+    lines = re.findall(
+        r"cost \[(\S+)\] multiplier \[(\S+)\]",
+        run(script, tmp_path, ["-W", "error::FutureWarning"]),
+    )
     assert len(lines) == 2
     multiplier = 0.0
     for cost, shown in lines:
@@ -50,20 +69,44 @@ def test_readme_loop(tmp_path):
         multiplier = max(0, multiplier + 0.2 * (float(cost) - 0.5))
         assert float(shown) == pytest.approx(multiplier, abs=0.01)
         multiplier = float(shown)
+    script.write_text(f"import torch\n{use}print(action.shape)\n{DRIVE}", encoding="utf-8")
+    *moved, shape = run(script, tmp_path).splitlines()[-6:]
+    assert shape == "(3,)"
+    assert len({line for line in moved if line.startswith("moved by 0.")}) == 5
+
+
+RULE = """
+import torch
+from torchrl.objectives import LossModule
+
+loss = LossModule()
+loss.register_buffer("lagrange_multiplier", torch.zeros(1))
+rule = Exponentiated(loss, cost_limit=0.5)
+for cost in (30.0, 0.0):
+    for _ in range(40):
+        rule.step(torch.full((4, 1), cost))
+        print(loss.lagrange_multiplier.item())
+"""
 
 
 def test_readme_recipes(tmp_path):
-    arm, cost, rule = code_of("README.md")[1:]
+    arm, cost, rule = code_of("README.md")[2:]
     check = "print(env.rollout(3)['next', 'cost'].shape[-1])\n"
     script = tmp_path / "recipes.py"
-    script.write_text("\n".join([arm, check, cost, check, rule]), encoding="utf-8")
-    assert run(script).split() == ["1", "2"]
+    script.write_text("\n".join([arm, check, cost, check, rule, RULE]), encoding="utf-8")
+    one, two, *multipliers = map(float, run(script).split())
+    assert (one, two) == (1, 2)
+    # From 0 to effect within some batches, never by leaps, and down again when the limit is kept.
+    assert multipliers[0] == pytest.approx(0.01, rel=0.25)
+    assert all(0.8 < last / first < 1.25 for first, last in pairwise(multipliers))
+    assert max(multipliers) == multipliers[39] > 5 * multipliers[0]
+    assert multipliers[-1] < multipliers[39] / 2
 
 
 def test_environments(tmp_path):
     """Each block runs by itself, and each environment in it is one."""
     blocks = code_of("docs/environments.md")
-    assert len(blocks) == 6
+    assert len(blocks) == 7
     script = tmp_path / "environments.py"
     check = "env.reset()\nenv.close()\n"
     script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")
@@ -125,6 +168,22 @@ def test_trainers(tmp_path):
     assert int(step) == 1280
     assert float(shown[0]) == pytest.approx(max(0, 0.2 * (float(cost) - 0.5)), abs=0.01)
     assert (tmp_path / "runs" / "checkpoint").exists()
+
+
+def test_testing(tmp_path):
+    """A loss that a user wrote passes all checks but the one that it is said to fail."""
+    own, failing, every, rule = code_of("docs/testing.md")
+    assert len(own.splitlines()) < 30
+    script = tmp_path / "own.py"
+    caught = (
+        f"try:\n    {failing.splitlines()[0]}\nexcept AssertionError as error:\n    print(error)\n"
+    )
+    # The doctest of check_loss runs the call.
+    *imports, _ = every.splitlines()
+    script.write_text("\n".join([own, caught, *imports, rule]), encoding="utf-8")
+    shown = run(script)
+    expected = failing.splitlines()[1].removeprefix("# AssertionError: ").removesuffix(" ...")
+    assert shown.startswith(expected)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda p: p.stem)

@@ -1,18 +1,22 @@
 """The figures that are reported: from episodes to the cells of the table."""
 
+from functools import partial
+
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl._utils import seed_generator
-from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs import Compose, GymWrapper, RenameTransform, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
-from experiments.evaluation import evaluate, summarize
 from experiments.log import figures
 from experiments.report import table
-from torchrl_safe.envs import ArmEnv, NoObstacles
+from torchrl_safe.envs import ArmEnv, CostToReward, NoObstacles
+from torchrl_safe.evaluation import evaluate, summarize
 
 
 def one(state):
@@ -21,8 +25,8 @@ def one(state):
 
 def fly_left(observation):
     """To goals on the left, straight; where the goal is on the right, nowhere."""
-    to_goal = observation[:, 20:23]
-    return (to_goal / 0.05).clamp(-1, 1) * (to_goal[:, 1:2] > -0.01)
+    to_goal = observation[..., 20:23]
+    return (to_goal / 0.05).clamp(-1, 1) * (to_goal[..., 1:2] > -0.01)
 
 
 def policy(tensordict):
@@ -57,6 +61,61 @@ def test_evaluation_plays_the_first_episode_of_each_seed(make_env):
     # Both kinds of end occur, and those that arrive have time for a second episode.
     assert 0 < episodes["success"].sum() < 6
     assert episodes["steps"][episodes["success"]].max() < 30
+
+
+def test_the_sums_are_those_of_reward_sum(make_env):
+    """Without the transform, in one process and in batches of batches."""
+    settings = {"num_envs": 2, "obstacles": NoObstacles(), "costs": {"one": one, "two": one}}
+    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
+    expected = evaluate(
+        make_env(lambda: TransformedEnv(ArmEnv(**settings), sums)), policy, 4, seed=4
+    )
+    env = make_env(ArmEnv, **settings)
+    episodes = evaluate(env, policy, 4, seed=4)
+    torch.testing.assert_close(episodes, expected)
+    assert episodes["episode_cost"].shape == (4, 2)
+    assert "episode_reward" not in env.rollout(1)["next"], "the environment is as it was"
+    batched = make_env(lambda: SerialEnv(2, partial(ArmEnv, **settings)))
+    assert evaluate(batched, policy, 5, seed=4).shape == (8,)
+
+
+class Counting(gymnasium.Env):
+    """Ends after as many steps as the seed says; the first of two observations is the cost."""
+
+    observation_space = gymnasium.spaces.Box(0, 9, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.length = 0, self.np_random.integers(1, 6)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.ones(2, np.float32), 0.5, self.steps >= self.length, False, {}
+
+
+def test_any_environment_with_a_cost():
+    still = TensorDictModule(lambda observation: observation[..., :1], ["observation"], ["action"])
+    cost = RenameTransform(["observation"], ["cost"], create_copy=True)
+    plain = GymWrapper(Counting())
+    env = TransformedEnv(plain, Compose(cost, CostToReward()))
+    episodes = evaluate(env, still, 20, seed=0)
+    assert set(episodes.keys()) == {"episode_reward", "episode_cost", "steps"}
+    assert set(episodes["steps"].squeeze(-1).tolist()) == {1, 2, 3, 4, 5}
+    torch.testing.assert_close(episodes["episode_reward"], 0.5 * episodes["steps"])
+    torch.testing.assert_close(episodes["episode_cost"], episodes["steps"].float().expand(20, 2))
+    assert list(summarize(episodes)) == [
+        "return", "steps", "cost/0", "any/0", "cost/1", "any/1"
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match="max_steps must let every episode end, got 2, "):
+        evaluate(env, still, 20, seed=0, max_steps=2)
+    with pytest.raises(ValueError, match="env must have the key 'cost' or 'episode_cost', got"):
+        evaluate(plain, still, 1, seed=0)
+    with pytest.raises(ValueError, match="episodes must be a whole number of at least 1, got 0"):
+        evaluate(env, still, 0, seed=0)
+    with pytest.raises(ValueError, match=r"cost_names must be one for each of the 2 costs, got \("):
+        summarize(episodes, ("one",))
 
 
 def test_summary_of_hand_made_episodes():

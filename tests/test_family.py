@@ -1,4 +1,4 @@
-"""Every algorithm ends at the constrained optimum of one small problem, see ``cmdp.py``.
+"""Every algorithm ends at the constrained optimum of one small problem, see ``ConstrainedBandit``.
 
 With p the share of action A, the reward advantage is standardized and the cost advantage centred:
 A_r = (1[A] - p) / s with s = sqrt(p (1 - p)), and A_c = (1[A] - p) for the cost that binds,
@@ -11,7 +11,6 @@ from functools import partial
 
 import pytest
 import torch
-from cmdp import LIMIT, epochs, learn, train
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, ReinforceLoss
 
 from torchrl_safe.objectives import (
@@ -26,6 +25,9 @@ from torchrl_safe.objectives import (
     PPOLagrangianLoss,
     ViolationUpdater,
 )
+from torchrl_safe.testing import ConstrainedBandit, run_epochs, train_on_bandit
+
+LIMIT = ConstrainedBandit.optimal_probability
 
 # A_r - lambda A_c vanishes here at p = LIMIT.
 MULTIPLIER = 1 / math.sqrt(LIMIT * (1 - LIMIT))
@@ -37,8 +39,8 @@ pid = partial(PIDControl, kp=5.0, ki=1.0, kd=5.0, smoothing=0.5)
 def wrapping(make, parent):
     """``make`` around ``parent``, as a function of the networks."""
 
-    def build(actor, critic, cost_critic):
-        return make(parent(actor, critic), cost_critic, num_costs=2)
+    def build(actor, critic, cost_critic, num_costs):
+        return make(parent(actor, critic), cost_critic, num_costs=num_costs)
 
     return build
 
@@ -46,8 +48,8 @@ def wrapping(make, parent):
 def of_one_step(make, **kwargs):
     """``make`` for episodes of one step, as a function of the networks."""
 
-    def build(*networks):
-        loss = make(*networks, num_costs=2, entropy_bonus=False, **kwargs)
+    def build(*networks, num_costs):
+        loss = make(*networks, num_costs=num_costs, entropy_bonus=False, **kwargs)
         # GAE's vectorized recursion of TorchRL 0.14 fails for a discount of 0.
         return loss.make_cost_value_estimator(gamma=0.0, vectorized=False)
 
@@ -55,9 +57,13 @@ def of_one_step(make, **kwargs):
 
 
 def learn_in_two_phases(loss, optimizer, buffer):
-    learn(loss, optimizer, buffer)
+    run_epochs(loss, optimizer, buffer)
     loss.start_projection()
-    epochs(loss.projection_loss, optimizer, buffer)
+    run_epochs(loss.projection_loss, optimizer, buffer)
+
+
+def violation(loss):
+    return loss.cost_violation
 
 
 NO_BONUS = {"entropy_bonus": False}
@@ -84,7 +90,7 @@ def last(outcome, count):
 
 @pytest.mark.parametrize("make", LAGRANGIAN.values(), ids=LAGRANGIAN.keys())
 def test_lagrangian_losses_reach_the_optimum_and_its_multipliers(make):
-    outcome = train(0, make, pid, batches=80, read=lambda loss: loss.lagrange_multiplier)
+    outcome = train_on_bandit(make, pid, num_batches=80)
     share, multiplier = last(outcome, 40)
     assert share.item() == pytest.approx(LIMIT, abs=0.01)
     assert multiplier[0].item() == pytest.approx(MULTIPLIER, abs=0.05)
@@ -94,9 +100,7 @@ def test_lagrangian_losses_reach_the_optimum_and_its_multipliers(make):
 def test_cup_reaches_the_optimum():
     make = of_one_step(CUPLoss, multiplier_init=1.0)
     rule = partial(PIDControl, kp=5.0, ki=0.5, kd=0.0)
-    outcome = train(
-        0, make, rule, 50, learn=learn_in_two_phases, read=lambda loss: loss.lagrange_multiplier
-    )
+    outcome = train_on_bandit(make, rule, num_batches=50, learn=learn_in_two_phases)
     share, multiplier = last(outcome, 30)
     assert share.item() == pytest.approx(LIMIT, abs=0.01)
     assert multiplier[0] > 0.5
@@ -109,7 +113,8 @@ def test_p3o_reaches_the_optimum():
     Noise makes it fall short of the limit by a little: it pushes whenever a batch is above.
     """
     make = of_one_step(P3OLoss, penalty_coeff=5.0)
-    share, _ = last(train(0, make, ViolationUpdater, 50, lr=0.03), 30)
+    outcome = train_on_bandit(make, ViolationUpdater, num_batches=50, lr=0.03, read=violation)
+    share, _ = last(outcome, 30)
     assert share.item() == pytest.approx(LIMIT, abs=0.02)
 
 
@@ -127,17 +132,16 @@ def test_ipo_keeps_the_distance_of_its_barrier():
         middle = (low + high) / 2
         low, high = (middle, high) if force(middle) > 0 else (low, middle)
     make = of_one_step(IPOLoss, sharpness=SHARPNESS)
-    share, violation = last(
-        train(0, make, ViolationUpdater, 50, lr=0.03, read=lambda loss: loss.cost_violation), 30
-    )
+    outcome = train_on_bandit(make, ViolationUpdater, num_batches=50, lr=0.03, read=violation)
+    share, excess = last(outcome, 30)
     assert share.item() == pytest.approx(low, abs=0.006)
-    assert (violation < 0).all()
+    assert (excess < 0).all()
 
 
 @pytest.mark.parametrize("make", CRPO.values(), ids=CRPO.keys())
 def test_crpo_swings_about_the_limit(make):
     """It only learns of a violation when it has happened: its mean is a little above the limit."""
-    shares, _ = train(0, make, ViolationUpdater, 50, lr=0.03)
+    shares, _ = train_on_bandit(make, ViolationUpdater, num_batches=50, lr=0.03, read=violation)
     assert shares[-30:].mean().item() == pytest.approx(LIMIT, abs=0.05)
     assert shares[-30:].min() < LIMIT < shares[-30:].max()
 
@@ -147,15 +151,15 @@ UNCONSTRAINED = {**LAGRANGIAN, "crpo": CRPO["clip-ppo"], "cup": of_one_step(CUPL
 
 @pytest.mark.parametrize("make", UNCONSTRAINED.values(), ids=UNCONSTRAINED.keys())
 def test_without_its_rule_each_exceeds_the_limit(make):
-    shares, _ = train(0, make, None, batches=20)
+    shares, _ = train_on_bandit(make, num_batches=20, read=lambda loss: loss.cost_critic_coeff)
     assert shares[-5:].mean() > 2 * LIMIT
 
 
 def test_the_optimum_is_the_same_for_ppo_lagrangian_to_the_bit():
     wrapped = LAGRANGIAN["clip-ppo"]
     outcomes = [
-        train(0, make, partial(DualAscent, lr=1.0), 10, read=lambda loss: loss.lagrange_multiplier)
-        for make in (wrapped, partial(PPOLagrangianLoss, num_costs=2, **NO_BONUS))
+        train_on_bandit(make, partial(DualAscent, lr=1.0), num_batches=10)
+        for make in (wrapped, partial(PPOLagrangianLoss, **NO_BONUS))
     ]
     for ours, theirs in zip(*outcomes, strict=True):
         assert torch.equal(ours, theirs)

@@ -20,7 +20,8 @@ from torchrl.envs.utils import RandomPolicy
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from experiments.algorithms import ALGORITHMS
-from experiments.train import Config, make_env, train
+from experiments.config import Config
+from experiments.train import make_env, train
 from torchrl_safe.envs import ArmEnv, Collision, FullObservation, InFront, Placement, Reach
 from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from networks import make_actor, make_batch, make_critic, make_loss, make_networks
+from on_policy import make_loss
 from tensordict.utils import unravel_key
 from torch.distributions import kl_divergence
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, PPOLoss, SoftUpdate
@@ -28,6 +28,7 @@ from torchrl_safe.objectives.crpo import rectified_advantage
 from torchrl_safe.objectives.cup import projection_objective
 from torchrl_safe.objectives.ipo import log_barrier
 from torchrl_safe.objectives.p3o import exact_penalty
+from torchrl_safe.testing import make_actor, make_batch, make_critic, make_networks
 
 
 def crpo(actor, critic, cost_critic, *, num_costs=1, tolerance=0.0, **kwargs):
@@ -48,7 +49,7 @@ def build(make, num_costs=1, seed=0, **kwargs):
 
 
 def estimated(loss, num_costs=1, seed=1):
-    return loss.estimate_advantages(make_batch(num_costs, seed)).reshape(-1)
+    return loss.estimate_advantages(make_batch(num_costs, seed=seed)).reshape(-1)
 
 
 def step(loss, violation):
@@ -301,11 +302,56 @@ def test_the_penalty_of_an_unmoved_policy_is_that_of_the_limit_in_every_minibatc
         torch.testing.assert_close(loss(part)["loss_penalty"], expected)
 
 
-@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss, CUPLoss])
-def test_costs_without_discount_are_refused(kind):
+def test_costs_without_discount_are_refused():
     """1 / (1 - gamma) is how many steps an episode is taken to have."""
     with pytest.raises(ValueError, match=r"gamma of the costs must be below 1, got 1\.0"):
+        build(CUPLoss).make_cost_value_estimator(gamma=1.0)
+
+
+@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss])
+def test_without_discount_the_length_of_an_episode_must_be_given(kind):
+    with pytest.raises(ValueError, match=r"episode_length must be given.*gamma 1\.0"):
         build(kind).make_cost_value_estimator(gamma=1.0)
+    loss = build(kind, episode_length=40)
+    loss.make_cost_value_estimator(gamma=1.0)
+    data = estimated(loss)
+    step(loss, [1.0])
+    assert loss(data)["loss_penalty"] > 0
+    for value in (0, -1.0, float("nan"), "long"):
+        with pytest.raises(ValueError, match=rf"episode_length.*{value}"):
+            build(kind, episode_length=value)
+
+
+def test_the_length_of_an_episode_says_what_a_step_is_worth():
+    """40 steps, discounted by 0.99: 1 - gamma takes them for 100, and the effect for 2.5 times."""
+    default, true = build(P3OLoss), build(P3OLoss, episode_length=40)
+    data = estimated(true)
+
+    def effect(loss):
+        """Of the policy's change on the cost of an episode: where the line of the penalty ends."""
+        penalties = []
+        for violation in (4.0, 8.0):
+            step(loss, [violation])
+            penalties.append(loss(data)["loss_penalty"].item())
+        near, far = penalties
+        return 4 * near / (far - near) - 4
+
+    assert abs(effect(true)) > 0.1
+    assert effect(default) == pytest.approx(2.5 * effect(true), rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss])
+def test_the_length_of_an_episode_takes_the_place_of_the_discount(kind):
+    """50 steps are 1 / (1 - 0.98)."""
+    by_discount, by_length = build(kind), build(kind, episode_length=50)
+    data = estimated(by_length)
+    by_discount.make_cost_value_estimator(gamma=0.98)
+    for loss in (by_discount, by_length):
+        step(loss, [0.5])
+    expected = by_discount(data)["loss_penalty"]
+    torch.testing.assert_close(by_length(data)["loss_penalty"], expected)
+    step(by_discount, [0.25])
+    assert not torch.isclose(by_discount(data)["loss_penalty"], expected)
 
 
 @pytest.mark.parametrize("violation", [[0.5, 2.0, -1.0], [2.0, 0.5, -1.0], [0.5, 0.75, -1.0]])
@@ -449,7 +495,7 @@ NESTED = {
 
 @every_loss
 def test_all_keys_can_be_nested(make):
-    networks = make_networks(2, value=NESTED["value"], cost_value=NESTED["cost_value"])
+    networks = make_networks(2, keys=NESTED)
     loss, expected = make(*networks, num_costs=2), build(make, 2)
     loss.set_keys(**NESTED)
     assert ("next", "info", "cost") in loss.in_keys

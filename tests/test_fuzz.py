@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings, strategies as st
-from networks import make_batch, make_networks
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import ClipPPOLoss, LossModule
 
 from torchrl_safe import envs, metrics, objectives
 from torchrl_safe.envs import ArmEnv
+from torchrl_safe.testing import make_batch, make_networks
 
 # ---------------------------------------------------------------- values
 

@@ -39,6 +39,22 @@ def test_the_losses_need_no_simulator():
     assert others == {"torchrl_safe._checks"}
 
 
+def test_testing_needs_the_losses_only():
+    """No test runner, no simulator: a user may have another one, or none."""
+    code = (
+        "import sys\n"
+        "for name in ('pytest', 'hypothesis', 'pybullet', 'gymnasium'): sys.modules[name] = None\n"
+        "import torchrl_safe.testing\n"
+        "print(*(n for n in sys.modules if n.startswith('torchrl_safe.')))"
+    )
+    done = run(code)
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.split())
+    assert "torchrl_safe.testing.suite" in loaded
+    packages = ("torchrl_safe.objectives", "torchrl_safe.testing")
+    assert {n for n in loaded if not n.startswith(packages)} == {"torchrl_safe._checks"}
+
+
 def test_the_trainers_need_the_losses_only():
     """Neither environments nor simulator; Hydra for its configurations, which say so."""
     code = (
@@ -74,8 +90,19 @@ def test_the_transforms_need_no_simulator():
     assert needed in done.stderr
 
 
-def test_the_metrics_need_neither_simulator_nor_environments_nor_losses():
-    assert load("torchrl_safe.metrics") == {"torchrl_safe.metrics"}
+@pytest.mark.parametrize(
+    ("module", "needed"),
+    [
+        ("policy", {"_files", "_program"}),
+        ("evaluation", {"_checks", "metrics"}),
+        ("metrics", set()),
+        ("checkpoint", set()),
+        ("collectors", set()),
+    ],
+)
+def test_these_need_neither_simulator_nor_environments_nor_losses(module, needed):
+    names = {f"torchrl_safe.{name}" for name in (module, *needed)}
+    assert load(f"torchrl_safe.{module}") == names
 
 
 def test_the_metrics_say_what_they_need():
@@ -110,6 +137,9 @@ def is_in(name, package):
         pytest.param("objectives", "torchrl_safe.envs", id="losses-import-no-envs"),
         pytest.param("objectives", "torchrl_safe.trainers", id="losses-import-no-trainers"),
         pytest.param("objectives", "pybullet", id="losses-import-no-pybullet"),
+        pytest.param("objectives", "torchrl_safe.testing", id="losses-import-no-testing"),
+        pytest.param("testing", "torchrl_safe.envs", id="testing-imports-no-envs"),
+        pytest.param("testing", "pytest", id="testing-imports-no-pytest"),
         pytest.param("trainers", "torchrl_safe.envs", id="trainers-import-no-envs"),
     ],
 )

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from networks import OBSERVATION, make_batch, make_critic, make_loss, make_networks
+from on_policy import make_loss
 from tensordict.nn import (
     NormalParamExtractor,
     ProbabilisticTensorDictModule,
@@ -28,6 +28,7 @@ from torchrl.objectives import (
 )
 
 from torchrl_safe.objectives import DualAscent, LagrangianLoss, PIDControl, penalized_advantage
+from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
 
 PARENTS = {
     "a2c": A2CLoss,
@@ -176,7 +177,7 @@ def test_each_network_is_trained_by_its_own_loss(parent):
 @pytest.mark.parametrize("parent", [A2CLoss, ClipPPOLoss])
 def test_only_the_policy_trains_a_shared_trunk_with_separate_losses(parent, separate):
     torch.manual_seed(0)
-    trunk = TensorDictModule(nn.Linear(OBSERVATION, 8), ["observation"], ["hidden"])
+    trunk = TensorDictModule(nn.Linear(OBSERVATION_SIZE, 8), ["observation"], ["hidden"])
     policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
     actor = ProbabilisticTensorDictSequential(
         trunk,
@@ -215,9 +216,7 @@ def test_the_wrapper_writes_nothing_into_its_input():
 @pytest.mark.parametrize("parent", [A2CLoss, ReinforceLoss, ClipPPOLoss])
 def test_all_keys_can_be_nested(parent):
     values = {"value": ("estimates", "v"), "cost_value": ("estimates", "c")}
-    actor, critic, cost_critic = make_networks(
-        2, value=values["value"], cost_value=values["cost_value"]
-    )
+    actor, critic, cost_critic = make_networks(2, keys=values)
     loss = LagrangianLoss(parent(actor, critic), cost_critic, num_costs=2, multiplier_init=0.7)
     keys = {
         **values,
@@ -399,7 +398,7 @@ def test_recurrent_critics_see_whole_sequences_in_both_ways():
             return super().forward(observation)
 
     actor, critic, _ = make_networks()
-    cost_critic = ValueOperator(Critic(OBSERVATION, 1), out_keys=["cost_value"])
+    cost_critic = ValueOperator(Critic(OBSERVATION_SIZE, 1), out_keys=["cost_value"])
     loss = LagrangianLoss(ClipPPOLoss(actor, critic, entropy_bonus=False), cost_critic)
     loss.estimate_advantages(make_batch())
     loss(make_batch())

@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from networks import make_loss
+from on_policy import make_loss
 from torch.distributions.transforms import SoftplusTransform
 from torchrl.objectives import LossModule
 
@@ -297,6 +297,95 @@ def test_bad_arguments_are_named(name, value):
     arguments = {"cost_limit": 1.0, "lr": 0.1, name: value}
     with pytest.raises(ValueError, match=f"^{name} must"):
         DualAscent(make_module(0.0, 0.0), **arguments)
+
+
+NAMED = {"collision": 0.5, "speed": 2.0}
+RULES = {
+    "dual": partial(DualAscent, lr=0.1),
+    "pid": partial(PIDControl, kp=1.0, ki=0.1, kd=0.0),
+}
+every_rule = pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
+
+
+@every_rule
+def test_limits_go_by_name(rule):
+    """Whatever order they are written in; the state is that of limits in their order."""
+    backwards = dict(reversed(NAMED.items()))
+    named = [
+        rule(make_module(0.0, 0.0), cost_limit=limits, cost_names=("collision", "speed"))
+        for limits in (NAMED, backwards)
+    ]
+    plain = rule(make_module(0.0, 0.0), cost_limit=torch.tensor([0.5, 2.0]))
+    for updater in named:
+        assert updater.cost_names == ("collision", "speed")
+        assert updater.state_dict().keys() == plain.state_dict().keys()
+        assert torch.equal(updater.cost_limit, plain.cost_limit)
+    for updater in (*named, plain):
+        updater.step(episodes(1.5, 2.0))
+    for updater in named:
+        expected = plain.loss_module.lagrange_multiplier
+        assert torch.equal(updater.loss_module.lagrange_multiplier, expected)
+        assert expected[0] > 0 == expected[1]
+    assert plain.cost_names == ("0", "1")
+    plain.load_state_dict(named[0].state_dict())
+
+
+@pytest.mark.parametrize(
+    ("limits", "names", "message"),
+    [
+        (NAMED, None, r"cost_names must give the costs in their order, .* got None and {'coll"),
+        (NAMED, ["collision"], "cost_names must be a different name for each of the 2 costs, got"),
+        (1.0, ["one", "one"], "cost_names must be a different name for each of the 2 costs, got"),
+        (1.0, "ab", "cost_names must be a different name for each of the 2 costs, got 'ab'"),
+        (1.0, [0, 1], r"cost_names must be a different name for each of the 2 costs, got \[0"),
+        (
+            {"collision": 0.5},
+            ["collision", "speed"],
+            r"each of cost_names \('collision', 'speed'\), got .* missing \['speed'\], unknown \[",
+        ),
+        (
+            {**NAMED, "sped": 1.0},
+            ["collision", "speed"],
+            r"cost_limit must have .* missing \[\], unknown \['sped'\]",
+        ),
+        (
+            {"a": 1.0, "b": "two"},
+            ["a", "b"],
+            "cost_limit must be finite, got {'a': 1.0, 'b': 'two'",
+        ),
+        ({"a": 1.0, "b": NAN}, ["a", "b"], "cost_limit must be finite, got {'a': 1.0, 'b': nan"),
+    ],
+)
+@every_rule
+def test_names_that_do_not_fit_are_refused(rule, limits, names, message):
+    with pytest.raises(ValueError, match=message):
+        rule(make_module(0.0, 0.0), cost_limit=limits, cost_names=names)
+
+
+def test_a_rule_of_ones_own_has_limits_by_name():
+    class Doubled(MultiplierUpdater):
+        def next_multiplier(self, multiplier, violation):
+            return 2 * violation
+
+    updater = Doubled(make_module(0.0, 0.0), cost_limit=NAMED, cost_names=[*NAMED])
+    updater.step(episodes(1.5, 3.0))
+    assert updater.loss_module.lagrange_multiplier.tolist() == [2, 2]
+
+
+def test_errors_name_the_cost():
+    updater = DualAscent(make_module(0.0, 0.0), cost_limit=NAMED, cost_names=[*NAMED], lr=0.1)
+    cost = torch.tensor([[1.0, 2.0], [1.0, NAN]])
+    with pytest.raises(ValueError, match=r"finite, got (?s:.*)nan.* for cost speed\.") as raised:
+        updater.step(cost)
+    assert "collision" not in str(raised.value)
+    largest = torch.finfo(torch.float32).max
+    with pytest.raises(ValueError, match=r"a mean and deviation (?s:.*) for cost collision\."):
+        updater.step(torch.tensor([[largest, 1.0], [largest, 1.0]]))
+    with pytest.raises(ValueError, match=r"a column for each of the costs collision, speed\."):
+        updater.step(torch.zeros(1, 3))
+    unnamed = DualAscent(make_module(0.0, 0.0), cost_limit=1.0, lr=0.1)
+    with pytest.raises(ValueError, match=r"finite, got (?s:.*) for cost 1\."):
+        unnamed.step(cost)
 
 
 def test_normalized_limits_are_not_negative():

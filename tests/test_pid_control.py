@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from networks import make_loss
+from on_policy import make_loss
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives import DualAscent, PIDControl

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from networks import OBSERVATION, make_batch, make_critic, make_loss, make_networks, mlp
+from on_policy import make_loss
 from tensordict.nn import (
     CompositeDistribution,
     NormalParamExtractor,
@@ -24,6 +24,8 @@ from torchrl.objectives import ClipPPOLoss, SoftUpdate
 from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives import CostGAE, DualAscent, PPOLagrangianLoss, penalized_advantage
+from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
+from torchrl_safe.testing.networks import mlp
 
 NETWORKS = ("actor", "critic", "cost_critic")
 # Only these outputs have a gradient, and this is the network each of them trains.
@@ -71,7 +73,7 @@ def assert_close_outputs(actual, expected):
 
 def estimated(loss, num_costs=1, seed=1):
     """A flat batch with both advantages."""
-    return loss.estimate_advantages(make_batch(num_costs, seed)).reshape(-1)
+    return loss.estimate_advantages(make_batch(num_costs, seed=seed)).reshape(-1)
 
 
 # ---------------------------------------------------------------- multiplier zero: ClipPPOLoss
@@ -414,7 +416,7 @@ def test_each_loss_trains_one_network(name, precomputed, functional):
 def make_shared(num_costs=2, **kwargs):
     """A loss whose three networks share their first layer, and that layer."""
     torch.manual_seed(0)
-    trunk = TensorDictModule(nn.Linear(OBSERVATION, 8), ["observation"], ["hidden"])
+    trunk = TensorDictModule(nn.Linear(OBSERVATION_SIZE, 8), ["observation"], ["hidden"])
     policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
     actor = ProbabilisticTensorDictSequential(
         trunk,
@@ -577,8 +579,7 @@ FROM_THE_BATCH = {"reward", "done", "terminated", "cost"}
 
 def run_with_keys(keys, **kwargs):
     """Outputs and batch with the entries named as in ``keys``."""
-    names = {**DEFAULT_KEYS, **keys}
-    networks = make_networks(2, value=names["value"], cost_value=names["cost_value"])
+    networks = make_networks(2, keys=keys)
     loss = PPOLagrangianLoss(*networks, num_costs=2, multiplier_init=0.7, clip_value=0.1, **kwargs)
     loss.set_keys(**keys)
     batch = make_batch(2)
@@ -610,7 +611,8 @@ def test_all_keys_can_be_nested_at_once(functional):
 
 
 def test_keys_can_be_set_one_by_one_whatever_the_critics_write():
-    loss = PPOLagrangianLoss(*make_networks(2, "v", ("costs", "v")), num_costs=2)
+    networks = make_networks(2, keys={"value": "v", "cost_value": ("costs", "v")})
+    loss = PPOLagrangianLoss(*networks, num_costs=2)
     loss.set_keys(cost_value=("costs", "v"))
     loss.set_keys(value="v")
     assert {"v", ("costs", "v")} <= set(loss.estimate_advantages(make_batch(2)).keys(True))
@@ -803,7 +805,7 @@ def make_composite(num_costs):
     class Heads(nn.Module):
         def __init__(self):
             super().__init__()
-            self.body = mlp(OBSERVATION, 5)
+            self.body = mlp(OBSERVATION_SIZE, 5)
 
         def forward(self, observation):
             out = self.body(observation)

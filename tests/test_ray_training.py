@@ -6,10 +6,11 @@ import pytest
 import ray
 import torch
 
-from experiments import evaluate, train
+from experiments import evaluate
 from experiments.algorithms import ALGORITHMS
-from experiments.policy import load_policy
+from experiments.config import Config as TrainConfig
 from experiments.ray_training import COSTS, Collection, Config, cluster, main, make_env
+from torchrl_safe.policy import load_policy
 
 # Ray leaves sockets and files to the garbage collector when a cluster is shut down.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
@@ -42,7 +43,7 @@ def test_two_costs_and_their_multipliers(tmp_path, capsys):
 
 def test_an_actor_is_killed_on_the_way():
     env = make_env(2)
-    training = ALGORITHMS["ppo-lagrangian"].build(env, train.Config(frames=480))
+    training = ALGORITHMS["ppo-lagrangian"].build(env, TrainConfig(frames=480))
     env.close()
     with cluster(None) as address:
         collection = Collection(SMALL, training.collector, address)

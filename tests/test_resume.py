@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from experiments.algorithms import ALGORITHMS
-from experiments.train import Config, main, train
+from experiments.config import Config
+from experiments.train import main, train
 
 ROOT = Path(__file__).parent.parent
 SETTINGS = {

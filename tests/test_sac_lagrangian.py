@@ -2,13 +2,10 @@
 
 import pytest
 import torch
-from networks import OBSERVATION
 from off_policy import (
     call,
     make_actor,
-    make_batch,
     make_cost_critic,
-    make_critic,
     make_loss,
     parameters,
 )
@@ -24,11 +21,12 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_safe.objectives import SACLagrangianLoss
+from torchrl_safe.testing import OBSERVATION_SIZE, make_q_critic, make_transitions
 
 
 def test_a_state_value_is_refused():
-    value = ValueOperator(nn.Linear(OBSERVATION, 1), in_keys=["observation"])
-    networks = make_actor(SACLagrangianLoss), make_critic(), make_cost_critic()
+    value = ValueOperator(nn.Linear(OBSERVATION_SIZE, 1), in_keys=["observation"])
+    networks = make_actor(SACLagrangianLoss), make_q_critic(), make_cost_critic()
     with pytest.raises(TypeError, match="value_network is not supported"):
         SACLagrangianLoss(*networks, value_network=value)
 
@@ -41,7 +39,7 @@ def test_the_entropy_is_divided_along_with_the_reward():
         for network in ("qvalue", "cost_qvalue"):
             for parameter in parameters(loss, network):
                 parameter.data.zero_()
-        losses.append(call(loss, make_batch()))
+        losses.append(call(loss, make_transitions()))
         losses[-1]["loss_actor"].backward()
         gradients.append(torch.cat([p.grad.flatten() for p in parameters(loss, "actor")]))
     torch.testing.assert_close(losses[1]["loss_actor"], losses[0]["loss_actor"] / 4)
@@ -52,11 +50,11 @@ def test_the_entropy_is_divided_along_with_the_reward():
 
 
 def test_target_entropy_from_the_action_spec():
-    networks = make_actor(SACLagrangianLoss), make_critic(), make_cost_critic()
+    networks = make_actor(SACLagrangianLoss), make_q_critic(), make_cost_critic()
     loss = SACLagrangianLoss(*networks, action_spec=Bounded(-1, 1, (2,)))
     SoftUpdate(loss, tau=0.5)
     assert loss.target_entropy.item() == -2.0
-    assert loss(make_batch())["loss_cost_qvalue"] > 0
+    assert loss(make_transitions())["loss_cost_qvalue"] > 0
 
 
 @pytest.mark.parametrize(("mode", "shown"), [("non_tensor", True), ("exclude", False)])
@@ -64,7 +62,7 @@ def test_multipliers_without_reduction(mode, shown):
     loss = make_loss(
         SACLagrangianLoss, 2, multiplier_init=0.5, reduction="none", scalar_output_mode=mode
     )
-    losses = loss(make_batch(2))
+    losses = loss(make_transitions(2))
     assert losses.batch_size == (12,)
     assert losses["loss_cost_qvalue"].shape == (12,)
     names = {f"lagrange_multiplier_{index}" for index in range(2)}
@@ -77,7 +75,7 @@ def test_multipliers_without_reduction(mode, shown):
 def test_done_states_can_be_skipped(shape):
     """Their actions are zeros then, for the costs as for the reward."""
     loss = make_loss(SACLagrangianLoss, 2, skip_done_states=True)
-    batch = make_batch(2).reshape(shape)
+    batch = make_transitions(2).reshape(shape)
     following = batch["next"]
     torch.manual_seed(3)
     action, log_prob = loss._draw_next_action(following)
@@ -115,7 +113,7 @@ def test_composite_actions():
         torch.manual_seed(0)
         keys = [("params", part, name) for part in ("arm", "gripper") for name in ("loc", "scale")]
         actor = ProbabilisticActor(
-            TensorDictModule(Heads(OBSERVATION, 4), ["observation"], keys),
+            TensorDictModule(Heads(OBSERVATION_SIZE, 4), ["observation"], keys),
             in_keys=["params"],
             out_keys=["arm", "gripper"],
             distribution_class=CompositeDistribution,
@@ -124,7 +122,7 @@ def test_composite_actions():
         )
         inputs = ["observation", ("action", "arm"), ("action", "gripper")]
         critics = [
-            ValueOperator(Critic(OBSERVATION + 2, 1), in_keys=inputs, out_keys=[key])
+            ValueOperator(Critic(OBSERVATION_SIZE + 2, 1), in_keys=inputs, out_keys=[key])
             for key in ("state_action_value", *added)
         ]
         loss = kind(actor, *critics, target_entropy=-2.0, num_qvalue_nets=2, **options)
@@ -138,7 +136,7 @@ def test_composite_actions():
         for ours, theirs in pairs:
             ours.data.copy_(theirs.data)
     SoftUpdate(loss, tau=0.5)
-    batch = make_batch()
+    batch = make_transitions()
     arm, gripper = batch.pop("action").split(1, -1)
     batch["action"] = {"arm": arm, "gripper": gripper}
     expected, losses = call(parent, batch.clone()), call(loss, batch.clone())

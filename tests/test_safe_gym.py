@@ -217,6 +217,24 @@ def test_costs_of_skipped_frames_add_up(make_env):
     assert rollout["next", "cost"].flatten().tolist() == [0.25 + 0.5, 0.75 + 1, 1.25]
 
 
+@pytest.mark.parametrize("num_envs", [0, 2])
+def test_a_class_without_a_constructor(make_env, forked_workers, num_envs):
+    """Python's error for it does not name the argument that TorchRL tries."""
+    env = make_env(SafeGymEnv, "counting:WithoutConstructor-v0", num_envs=num_envs)
+    check_counts(env.rollout(9, break_when_any_done=False), [4] * (num_envs or 1))
+
+
+def test_frames_of_a_class_without_a_constructor_are_skipped(make_env):
+    env = make_env(SafeGymEnv, "counting:WithoutConstructor-v0", frame_skip=2)
+    cost = env.rollout(3)["next", "cost"]
+    assert cost.flatten().tolist() == [0.25 + 0.5, 0.75 + 1]
+
+
+def test_an_argument_that_no_constructor_takes_is_an_error():
+    with pytest.raises(TypeError, match=r"takes no arguments .* kwargs \({'steps': 3"):
+        SafeGymEnv("counting:WithoutConstructor-v0", steps=3)
+
+
 def test_other_info_can_still_be_read(make_env):
     class Flag(Counting):
         def info(self):

@@ -169,23 +169,23 @@ def test_every_registered_combination_has_room(arm):
     """Drawn without physics; a million of each with `make draws ARGS="--draws 1000000"`."""
     home = tool_at_home(arm)
     for task in TASKS:
-        assert not any(misses(arm, task, home, 2_000).values()), task
+        assert not any(misses(arm, task, home, 1_000).values()), task
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arm", ARMS)
 def test_every_registered_combination_begins(make_env, monkeypatch, arm):
-    """With physics, that is with overlaps: there is one in a draw of ten at the most."""
+    """With physics, that is with overlaps: a fifth of the draws of Push and Scattered have one."""
     drawn = []
     for kind in {type(task) for task in TASKS.values()}:
         monkeypatch.setattr(kind, "sample", counting(kind.sample, drawn))
     for task, obstacles in product(TASKS, OBSTACLES):
         env = make_env(ArmEnv, **combination(arm, task, obstacles, ""), seed=0)
         drawn.clear()
-        for _ in range(300):
+        for _ in range(100):
             env.reset()
         env.close()
-        assert 300 <= len(drawn) < 330, (task, obstacles)
+        assert 100 <= len(drawn) < 150, (task, obstacles)
 
 
 def counting(function, calls):

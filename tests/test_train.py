@@ -14,11 +14,12 @@ from PIL import Image
 from torchrl.checkpoint import Checkpoint
 
 from experiments.agent import make_agent
-from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES
+from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES, OffPolicy
+from experiments.config import OFF_POLICY, AlgorithmName, Config
 from experiments.learners import NoiseSchedule
-from experiments.policy import load_policy
 from experiments.report import table
-from experiments.train import AlgorithmName, Config, main, make_env, train
+from experiments.train import main, make_env, train
+from torchrl_safe.policy import load_policy
 
 ROOT = Path(__file__).parent.parent
 
@@ -166,6 +167,8 @@ def test_agent_knows_how_far_its_own_noise_goes():
 
 def test_every_algorithm_has_a_name():
     assert set(ALGORITHMS) == set(get_args(AlgorithmName))
+    replaying = {name for name, algorithm in ALGORITHMS.items() if isinstance(algorithm, OffPolicy)}
+    assert replaying == set(OFF_POLICY)
 
 
 # One of each kind for `make test`. That they learn is tested on a problem of known optimum.
@@ -187,9 +190,9 @@ def test_every_algorithm_trains(algorithm, tmp_path):
     ]
     assert any(moved)
     assert (tmp_path / algorithm / "checkpoints" / "checkpoint-000000000512.torchrl").exists()
-    saved = load_policy(tmp_path / algorithm / "policy.pt").actor
+    saved = load_policy(tmp_path / algorithm / "policy.pt").weights
     for name, weight in actor.state_dict().items():
-        torch.testing.assert_close(saved.state_dict()[name], weight, rtol=0, atol=0)
+        torch.testing.assert_close(saved[name], weight, rtol=0, atol=0)
 
 
 def test_what_ends_an_episode_early_ends_none_that_is_evaluated():

@@ -5,8 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from cmdp import ENVS, TwoActions, make_networks
-from networks import make_batch, make_loss
+from on_policy import make_loss
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
@@ -34,6 +33,7 @@ from torchrl_safe.objectives import (
     TrustRegionLoss,
     ViolationUpdater,
 )
+from torchrl_safe.testing import ConstrainedBandit, make_batch, make_networks
 from torchrl_safe.trainers import MultiplierHook, PPOLagrangianTrainer
 
 WORLDS, STEPS, FRAMES = 4, 5, 40
@@ -160,7 +160,7 @@ def test_a_batch_in_which_no_episode_ended():
 
 
 def test_violations():
-    loss = P3OLoss(*make_networks(1))
+    loss = P3OLoss(*make_networks())
     hook = MultiplierHook(ViolationUpdater(loss, cost_limit=1.0), cost_names=["touch"])
     scalars = hook.log(hook(make_episodes([[3.0], [4.0]], [True, True])))
     assert scalars["cost_violation/touch"] == 2.5
@@ -205,6 +205,22 @@ def test_bad_names(settings, message):
     updater = DualAscent(make_loss(num_costs=2), cost_limit=1.0, lr=0.5)
     with pytest.raises(ValueError, match=message):
         MultiplierHook(updater, **settings)
+
+
+def test_names_are_those_of_the_updater():
+    loss, limits = make_loss(num_costs=2), {"touch": 1.0, "speed": 2.0}
+    updater = DualAscent(loss, cost_limit=limits, cost_names=["touch", "speed"], lr=0.5)
+    for hook in (MultiplierHook(updater), MultiplierHook(updater, cost_names=["touch", "speed"])):
+        batch = make_episodes([[3.0, 2.0]], [True])
+        assert set(hook.log(batch)) == {
+            "log_pbar",
+            "episode_cost/touch",
+            "episode_cost/speed",
+            "lagrange_multiplier/touch",
+            "lagrange_multiplier/speed",
+        }
+    with pytest.raises(ValueError, match=r"those of the updater, \('touch', 'speed'\), or be left"):
+        MultiplierHook(updater, cost_names=["speed", "touch"])
 
 
 def test_no_updater():
@@ -450,18 +466,19 @@ LOSSES = {
 def test_every_loss_that_one_optimizer_minimizes(make, rule):
     """Two actions, each with a cost of its own: whatever is done, the mean costs sum to 1."""
     torch.manual_seed(0)
-    actor, critic, cost_critic = make_networks()
+    env = ConstrainedBandit()
+    actor, critic, cost_critic = env.make_networks()
     loss = make(actor, critic, cost_critic, num_costs=2)
     rate = {"lr": 1.0} if rule is DualAscent else {}
     updater = rule(loss, cost_limit=0.0, **rate)
     before = [parameter.clone() for parameter in loss.parameters()]
     PPOLagrangianTrainer(
-        collector=make_collector(TwoActions(), actor, ENVS),
-        total_frames=ENVS,
+        collector=make_collector(env, actor, env.batch_size.numel()),
+        total_frames=env.batch_size.numel(),
         loss_module=loss,
         updater=updater,
         optimizer=torch.optim.SGD(loss.parameters(), lr=0.1),
-        replay_buffer=make_buffer(ENVS, ENVS // 2),
+        replay_buffer=make_buffer(env.batch_size.numel(), env.batch_size.numel() // 2),
         progress_bar=False,
         episode_cost_key="cost",  # Each episode is one step long.
     ).train()
@@ -473,13 +490,13 @@ def test_every_loss_that_one_optimizer_minimizes(make, rule):
 
 @pytest.mark.parametrize("make", [CUPLoss, TrustRegionLoss])
 def test_losses_with_a_loop_of_their_own(make):
-    loss = make(*make_networks(1))
+    loss = make(*make_networks())
     with pytest.raises(ValueError, match="loss_module must be minimized as it stands, got"):
         PPOLagrangianTrainer(loss_module=loss, updater=None, collector=None, total_frames=1)
 
 
 def test_a_loss_without_costs():
-    loss = ClipPPOLoss(*make_networks(1)[:2])
+    loss = ClipPPOLoss(*make_networks()[:2])
     with pytest.raises(TypeError, match=r"loss_module must be .* cost critic, .* got ClipPPOLoss"):
         PPOLagrangianTrainer(loss_module=loss, updater=None, collector=None, total_frames=1)
 

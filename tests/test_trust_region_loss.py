@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from networks import make_batch, make_critic, make_networks
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives import DualAscent, PIDControl, TrustRegionLoss, ViolationUpdater
+from torchrl_safe.testing import make_batch, make_critic, make_networks
 
 OPTIONS = {
     "default": {},
@@ -90,6 +90,38 @@ def test_masked_steps_do_not_count():
     expected = loss.cost_surrogate_loss(data[mask])
     data["cost_advantage"][~mask] = float("nan")
     torch.testing.assert_close(loss.cost_surrogate_loss(data), expected)
+
+
+@pytest.mark.parametrize("options", [{}, {"clip_value": 0.1}, {"functional": False}])
+def test_the_critics_alone_have_the_losses_of_the_whole(options):
+    """Bit for bit, their gradients too, and without a look at the policy."""
+    loss, data = make_loss(2, **options), estimated(2)
+    data["collector", "mask"] = torch.arange(len(data)) % 3 > 0
+    whole = loss(data)
+    expected = {key: whole[key] for key in ("loss_critic", "loss_cost_critic")}
+    gradients = torch.autograd.grad(sum(expected.values()), critics(loss))
+    losses = loss.critic_losses(data.exclude("action", "action_log_prob", "advantage"))
+    assert set(losses.keys()) == set(expected)
+    for key, value in expected.items():
+        assert torch.equal(losses[key], value), key
+    for value, other in zip(
+        gradients, torch.autograd.grad(sum(losses.values()), critics(loss)), strict=True
+    ):
+        assert torch.equal(value, other)
+    with pytest.raises(KeyError, match="cost_value_target"):
+        loss.critic_losses(data.exclude("cost_value_target"))
+
+
+def test_without_a_reward_critic_the_cost_critic_learns_alone():
+    loss, data = make_loss(critic_coeff=0.0), estimated()
+    assert set(loss.critic_losses(data).keys()) == {"loss_cost_critic"}
+
+
+def critics(loss):
+    networks = loss.critic_network, loss.cost_critic_network
+    if loss.functional:
+        networks = loss.critic_network_params, loss.cost_critic_network_params
+    return [parameter for network in networks for parameter in network.parameters()]
 
 
 def test_keys_can_be_nested():

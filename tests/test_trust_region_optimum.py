@@ -1,4 +1,4 @@
-"""Trust-region methods end where the mathematics of the tiny problem of ``cmdp.py`` says.
+"""Trust-region methods end where the mathematics of ``ConstrainedBandit`` says.
 
 The best policy takes action A with probability p = d = 0.3. TRPO-Lagrangian must find the
 multiplier too at which the gradient vanishes there, 1 / sqrt(d (1 - d)) = 2.182 as derived in
@@ -11,7 +11,6 @@ from functools import partial
 
 import pytest
 import torch
-from cmdp import LIMIT, epochs, train
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -27,13 +26,16 @@ from torchrl_safe.objectives import (
     TrustRegionStep,
     ViolationUpdater,
 )
+from torchrl_safe.testing import ConstrainedBandit, run_epochs, train_on_bandit
+
+LIMIT = ConstrainedBandit.optimal_probability
 
 
 def run(method, rule, *, num_costs, batches, seed=0, **kwargs):
     """Share of action A and multipliers, batch by batch; and the counts of the step."""
     steps = []
 
-    def make_loss(*networks):
+    def make_loss(*networks, num_costs):
         loss = TrustRegionLoss(*networks, num_costs=num_costs, entropy_bonus=False, **kwargs)
         # One step moves p by up to sqrt(2 * max_kl * p (1 - p)), here 0.02.
         steps.append(TrustRegionStep(loss, method, max_kl=1e-3, damping=1e-3, episode_length=1))
@@ -42,16 +44,10 @@ def run(method, rule, *, num_costs, batches, seed=0, **kwargs):
     def learn(loss, optimizer, buffer):
         steps[0].step(buffer[:])
         critics = "loss_critic", "loss_cost_critic"
-        epochs(lambda data: loss(data).select(*critics), optimizer, buffer, count=1)
+        run_epochs(lambda data: loss(data).select(*critics), optimizer, buffer, num_epochs=1)
 
-    shares, multipliers = train(
-        seed,
-        make_loss,
-        rule,
-        batches,
-        learn=learn,
-        read=lambda loss: loss.lagrange_multiplier,
-        num_costs=num_costs,
+    shares, multipliers = train_on_bandit(
+        make_loss, rule, num_batches=batches, num_costs=num_costs, seed=seed, learn=learn
     )
     return shares, multipliers, steps[0].state_dict()
 

@@ -4,10 +4,11 @@ import re
 
 import pytest
 import torch
-from networks import make_batch, make_loss, make_networks
+from on_policy import make_loss
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives import DualAscent, IPOLoss, P3OLoss, PIDControl, ViolationUpdater
+from torchrl_safe.testing import make_batch, make_networks
 
 
 def make(num_costs=2, cost_limit=1.0, kind=P3OLoss):
@@ -26,6 +27,18 @@ def test_it_writes_mean_cost_minus_limit_in_place(limit):
     assert loss.cost_violation.data_ptr() == address
     updater.step(torch.tensor([[1.5, second]]))
     assert loss.cost_violation.tolist() == [0.0, 0.0]
+
+
+def test_limits_go_by_name():
+    loss = P3OLoss(*make_networks(2), num_costs=2)
+    limits = {"speed": 4.0, "touch": 1.5}
+    updater = ViolationUpdater(loss, cost_limit=limits, cost_names=("touch", "speed"))
+    updater.step(torch.tensor([[2.0, 3.0]]))
+    assert loss.cost_violation.tolist() == [0.5, -1.0]
+    with pytest.raises(ValueError, match=r"missing \['speed'\], unknown \['velocity'\]"):
+        ViolationUpdater(
+            loss, cost_limit={"touch": 1, "velocity": 2}, cost_names=updater.cost_names
+        )
 
 
 def test_pessimism_adds_standard_errors():

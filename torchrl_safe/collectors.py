@@ -18,13 +18,14 @@ class ResumableCollector(Collector):
     The state of :class:`~torchrl.collectors.Collector` holds policy, transforms and counters:
     one that is loaded starts all episodes anew. This one also holds the simulator's state, the
     last observations with the running sums of :class:`~torchrl.envs.RewardSum` and all else that
-    is carried from step to step, and the state of torch's generator on the CPU, which a policy
-    there draws from. A collector that is loaded between two batches then collects what the saved
-    one would have collected, bit for bit. It takes an environment whose ``state_dict`` is
-    complete, such as :class:`~torchrl_safe.envs.ArmEnv`, with any transforms around it, in this
-    process or, as the ``collector_class`` of :class:`~torchrl.collectors.MultiSyncCollector`, in
-    workers (the trajectories may have other numbers there). Environments whose state has no
-    ``get_extra_state`` in it start their episodes anew.
+    is carried from step to step, and the states of torch's generators on the CPU and, if CUDA is in
+    use, on each of its devices, which a policy draws from. A collector that is loaded between two
+    batches then collects what the saved one would have collected, bit for bit. It takes an
+    environment whose ``state_dict`` is complete, such as :class:`~torchrl_safe.envs.ArmEnv`, with
+    any transforms around it, in this process or, as the ``collector_class`` of
+    :class:`~torchrl.collectors.MultiSyncCollector`, in workers (the trajectories may have other
+    numbers there). Environments whose state has no ``get_extra_state`` in it start their episodes
+    anew.
 
     Arguments are those of :class:`~torchrl.collectors.Collector`.
 
@@ -60,6 +61,8 @@ class ResumableCollector(Collector):
             state["carrier"] = self._carrier.exclude("next").clone().to_dict()
         # Tensors only: workers send their state as a TensorDict.
         state["torch_generator"] = torch.get_rng_state()
+        if torch.cuda.is_initialized():
+            state["cuda_generators"] = torch.stack(torch.cuda.get_rng_state_all())
         return state
 
     def load_state_dict(self, state_dict: OrderedDict, **kwargs: Any) -> None:
@@ -75,7 +78,11 @@ class ResumableCollector(Collector):
                 device=self._carrier.device,
             ).clone()
         if "torch_generator" in state_dict:
-            torch.set_rng_state(state_dict["torch_generator"])
+            torch.set_rng_state(state_dict["torch_generator"].cpu())
+        if "cuda_generators" in state_dict:
+            # As many of them as there are devices here: a run may go on without.
+            states = state_dict["cuda_generators"].cpu()[: torch.cuda.device_count()]
+            torch.cuda.set_rng_state_all(list(states))
 
 
 def _is_complete(state: Mapping[str, Any]) -> bool:

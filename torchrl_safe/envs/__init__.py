@@ -26,6 +26,7 @@ from torchrl_safe.envs.costs import (
     SpeedAndSeparation,
     Workspace,
 )
+from torchrl_safe.envs.home import find_home
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.observations import FullObservation, paper_observation
 from torchrl_safe.envs.obstacles import (
@@ -52,7 +53,7 @@ from torchrl_safe.envs.physics.simulator import Physics, Simulator
 from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
-from torchrl_safe.envs.transforms import CostToReward, EarlyTermination, Saute
+from torchrl_safe.envs.transforms import CostToReward, EarlyTermination, FrameSkip, Saute
 
 __all__ = [
     "IIWA",
@@ -81,6 +82,7 @@ __all__ = [
     "Cylinder",
     "DampedLeastSquares",
     "EarlyTermination",
+    "FrameSkip",
     "FullObservation",
     "Gripper",
     "Human",
@@ -114,6 +116,7 @@ __all__ = [
     "Swing",
     "Task",
     "Workspace",
+    "find_home",
     "paper_env",
     "paper_observation",
 ]

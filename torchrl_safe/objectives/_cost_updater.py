@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._checks import as_tensor, check_number
+from torchrl_safe.objectives._checks import as_number, as_tensor, check_number
 
 
 class CostUpdater(abc.ABC):
@@ -19,21 +20,34 @@ class CostUpdater(abc.ABC):
         loss_module (LossModule): a loss with the buffer named ``buffer_name``, of shape ``(k,)``.
 
     Keyword Args:
-        cost_limit (float or Tensor): limit of each expected episode cost, one number or k.
+        cost_limit (float, Tensor or Mapping): limit of each expected episode cost, one number, k,
+            or one for each of ``cost_names``.
         pessimism (float, optional): standard errors of the mean that are added to it.
+        cost_names (sequence of str, optional): names of the k costs in their order, for example
+            ``env.cost_names``, for errors and logs. Defaults to ``("0", "1", ...)``.
     """
 
     buffer_name: str
 
     def __init__(
-        self, loss_module: LossModule, *, cost_limit: float | Tensor, pessimism: float = 0.0
+        self,
+        loss_module: LossModule,
+        *,
+        cost_limit: float | Tensor | Mapping[str, float],
+        pessimism: float = 0.0,
+        cost_names: Sequence[str] | None = None,
     ) -> None:
         if not isinstance(loss_module, LossModule):
             raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
         buffer = dict(loss_module.named_buffers(recurse=False)).get(self.buffer_name)
         if buffer is None:
             raise ValueError(f"{type(loss_module).__name__} has no {self.buffer_name} buffer.")
-        limit = as_tensor("cost_limit", cost_limit, buffer.dtype)
+        names = check_names(cost_names, len(buffer))
+        if isinstance(cost_limit, Mapping):
+            numbers: Any = _in_order(cost_limit, None if cost_names is None else names)
+        else:
+            numbers = cost_limit
+        limit = as_tensor("cost_limit", numbers, buffer.dtype)
         if limit.shape not in ((), buffer.shape):
             raise ValueError(
                 f"cost_limit must be one number or one for each of the {len(buffer)} costs, "
@@ -43,6 +57,7 @@ class CostUpdater(abc.ABC):
             raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
         pessimism = check_number("pessimism", pessimism)
         self.loss_module = loss_module
+        self.cost_names = names
         self.cost_limit = limit.expand_as(buffer).clone()
         self.pessimism = pessimism
 
@@ -66,11 +81,16 @@ class CostUpdater(abc.ABC):
         if not isinstance(episode_cost, Tensor):
             raise TypeError(f"episode_cost must be a tensor, got {episode_cost!r}.")
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:
+            shape = tuple(episode_cost.shape)
             raise ValueError(
-                f"episode_cost must have shape (E, {len(buffer)}), got {tuple(episode_cost.shape)}."
+                f"episode_cost must have shape (E, {len(buffer)}), got {shape}: a column for each "
+                f"of the costs {', '.join(self.cost_names)}."
             )
-        if not episode_cost.isfinite().all():
-            raise ValueError(f"episode_cost must be finite, got {episode_cost}.")
+        if not (usable := episode_cost.isfinite().all(0)).all():
+            raise ValueError(
+                f"episode_cost must be finite, got {episode_cost[:, ~usable]} for cost "
+                f"{self._names_of(~usable)}."
+            )
         if not len(episode_cost):
             return
         self._move(buffer, episode_cost.to(buffer))
@@ -85,12 +105,16 @@ class CostUpdater(abc.ABC):
         if len(episode_cost) > 1:  # One alone has no standard error.
             cost = cost + self.pessimism * episode_cost.std(0) / len(episode_cost) ** 0.5
         violation = cost - self.cost_limit.to(cost)
-        if not violation.isfinite().all():
+        if not (usable := violation.isfinite()).all():
             raise ValueError(
                 f"episode_cost must have a mean and deviation within {violation.dtype}, got "
-                f"{episode_cost}."
+                f"{episode_cost[:, ~usable]} for cost {self._names_of(~usable)}."
             )
         return violation
+
+    def _names_of(self, chosen: Tensor) -> str:
+        pairs = zip(self.cost_names, chosen.tolist(), strict=True)
+        return ", ".join(name for name, is_chosen in pairs if is_chosen)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the updater; the buffer is in the state of the loss."""
@@ -116,3 +140,36 @@ class CostUpdater(abc.ABC):
             )
         self.cost_limit = state_dict["cost_limit"].clone()
         self.pessimism = state_dict["pessimism"]
+
+
+def check_names(cost_names: Sequence[str] | None, num_costs: int) -> tuple[str, ...]:
+    """Returns the names of the costs; raises ValueError unless there is one for each."""
+    names = [str(index) for index in range(num_costs)] if cost_names is None else cost_names
+    if (
+        isinstance(names, str)
+        or not isinstance(names, Sequence)
+        or not all(isinstance(name, str) for name in names)
+        or len(set(names)) != len(names)
+        or len(names) != num_costs
+    ):
+        raise ValueError(
+            f"cost_names must be a different name for each of the {num_costs} costs, got "
+            f"{cost_names!r}."
+        )
+    return tuple(names)
+
+
+def _in_order(cost_limit: Mapping[str, float], names: tuple[str, ...] | None) -> list[float]:
+    """The limits in the order of the names; what is no number becomes NaN."""
+    if names is None:
+        raise ValueError(
+            "cost_names must give the costs in their order, for example env.cost_names, where "
+            f"cost_limit goes by name, got None and {cost_limit!r}."
+        )
+    missing, unknown = [n for n in names if n not in cost_limit], [*set(cost_limit) - set(names)]
+    if missing or unknown:
+        raise ValueError(
+            f"cost_limit must have a limit for each of cost_names {names}, got {cost_limit!r}: "
+            f"missing {missing}, unknown {sorted(map(str, unknown))}."
+        )
+    return [as_number(cost_limit[name]) for name in names]

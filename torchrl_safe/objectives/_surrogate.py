@@ -11,8 +11,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe.objectives._checks import check_discount
-from torchrl_safe.objectives.violation import ViolationMixin
+from torchrl_safe.objectives.violation import (
+    ViolationMixin,
+    check_episode_length,
+    check_length_known,
+)
 
 
 def clipped_cost_surrogate(
@@ -48,8 +51,9 @@ def clipped_cost_surrogate(
 class CostSurrogateMixin(ViolationMixin):
     """Adds ``loss_penalty``, a function of the mean cost surrogates, to ``ClipPPOLoss``."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, episode_length: float | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.episode_length = check_episode_length(episode_length)
         if self.reduction != "mean":
             raise ValueError(
                 "reduction must be 'mean', since the penalty is a function of the batch mean, got "
@@ -58,7 +62,7 @@ class CostSurrogateMixin(ViolationMixin):
         self._log_ratios: Any = None
 
     def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
-        check_discount(estimator.gamma)
+        check_length_known(self.episode_length, estimator.gamma)
 
     @abc.abstractmethod
     def _penalty(self, surrogate: Tensor) -> Tensor:

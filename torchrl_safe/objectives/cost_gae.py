@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.value import GAE
@@ -23,9 +24,13 @@ class CostGAE(GAE):
     - it reads ``("next", "cost")`` and ``"cost_value"`` and writes ``"cost_advantage"`` and
       ``"cost_value_target"``, all of shape ``(*B, T, k)``; ``done`` and ``terminated`` keep
       their shape ``(*B, T, 1)`` and are broadcast over the k costs;
-    - ``average_gae`` **centres** each cost's advantage over the batch without dividing by its
-      standard deviation, so that a multiplier keeps its unit (reward per cost) from batch to
-      batch. It defaults to ``True``;
+    - with N agents, whose values have the shape ``(*B, T, N, k)``, cost, ``done`` and
+      ``terminated`` may be per agent or shared by all, of shape ``(*B, T, k)`` and
+      ``(*B, T, 1)``, as in :class:`~torchrl.objectives.value.MultiAgentGAE`; a shared cost wants
+      a shared ``done``;
+    - ``average_gae`` **centres** each cost's advantage over the batch (all agents together)
+      without dividing by its standard deviation, so that a multiplier keeps its unit (reward per
+      cost) from batch to batch. It defaults to ``True``;
     - ``vectorized`` defaults to ``True``.
 
     Keyword Args:
@@ -40,8 +45,9 @@ class CostGAE(GAE):
             excepted.
 
     Raises:
-        ValueError: if ``gamma`` or ``lmbda`` is out of its range; in a call, if the cost and the
-            value of a batch differ in shape.
+        ValueError: if ``gamma`` or ``lmbda`` is out of its range; in a call, if the cost,
+            ``done`` or ``terminated`` of a batch does not fit the shape of its value, or the
+            batch has n-step sums (``"steps_to_next_obs"``), which GAE cannot be made of.
 
     Examples:
         >>> import torch
@@ -109,19 +115,56 @@ class CostGAE(GAE):
     def vectorized(self, value: bool | None) -> None:
         self._vectorized = value
 
+    @dispatch
+    def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
+        self._check_single_steps(tensordict)
+        return super().forward(tensordict, *args, **kwargs)
+
+    def value_estimate(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Tensor:
+        self._check_single_steps(tensordict)
+        return super().value_estimate(tensordict, *args, **kwargs)
+
+    def _check_single_steps(self, tensordict: TensorDictBase) -> None:
+        # The recursion goes on with the next step, which the sum already contains.
+        if tensordict.get(key := self.tensor_keys.steps_to_next_obs, None) is not None:
+            raise ValueError(
+                f"{key!r} is in the batch, which a multi-step transform has put there: GAE wants "
+                "the rewards and costs of single steps, and sums them itself."
+            )
+
     def _prepare_signals(
         self, reward: Tensor, done: Tensor, terminated: Tensor, value: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
+        team, width = value.shape[:-2], value.shape[-1:]
+        # A cost without agents beside a done signal with them could be anything.
+        if done.shape == (*team, 1) and reward.shape == team + width:
+            reward = reward.unsqueeze(-2).expand_as(value)
         if reward.shape != value.shape:
             raise ValueError(
                 f"The cost {self.tensor_keys.reward!r} and its value {self.tensor_keys.value!r} "
                 f"must have one column for each constraint, got shapes {tuple(reward.shape)} and "
                 f"{tuple(value.shape)}."
             )
-        return reward, done.expand_as(value), terminated.expand_as(value)
+        return (
+            reward,
+            self._broadcast(self.tensor_keys.done, done, value),
+            self._broadcast(self.tensor_keys.terminated, terminated, value),
+        )
 
     def _broadcast_optional(self, tensor: Tensor, value: Tensor) -> Tensor:
-        return tensor.expand_as(value)
+        return self._broadcast("truncated", tensor, value)
+
+    def _broadcast(self, key: NestedKey, signal: Tensor, value: Tensor) -> Tensor:
+        """Gives a signal of all costs, or of all agents and costs, the shape of the values."""
+        if signal.shape == (*value.shape[:-2], 1):
+            signal = signal.unsqueeze(-2)
+        elif signal.shape not in ((*value.shape[:-1], 1), value.shape):
+            own, shared = (*value.shape[:-1], 1), (*value.shape[:-2], 1)
+            raise ValueError(
+                f"{key!r} must have the shape {own}, or {shared} if agents share it, where "
+                f"{self.tensor_keys.value!r} has {tuple(value.shape)}, got {tuple(signal.shape)}."
+            )
+        return signal.expand_as(value)
 
     def _normalize_advantage(
         self, adv: Tensor, valid: Tensor | None = None, groups: Tensor | None = None

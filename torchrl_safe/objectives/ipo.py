@@ -13,6 +13,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl_safe.objectives._checks import check_number
 from torchrl_safe.objectives._cost_critic import CostKeys
 from torchrl_safe.objectives._surrogate import CostSurrogateMixin
+from torchrl_safe.objectives.violation import per_step
 
 
 def log_barrier(violation: Tensor, sharpness: Tensor) -> Tensor:
@@ -84,14 +85,17 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
         num_costs (int, optional): number k of costs. Defaults to ``1``.
         sharpness (float, optional): the paper's t: the larger, the closer to the limit the
             barrier acts. Defaults to ``20.0``.
+        episode_length (float, optional): mean number of steps of an episode, to compare a
+            surrogate, which is about one step, with a violation, which is about an episode.
+            Defaults to :math:`1 / (1 - \gamma)`, as in the equation above.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
         ValueError: if ``num_costs`` or ``sharpness`` is not positive, ``reduction`` is not
-            ``"mean"`` or the discount of the costs is 1; in a call, if the cost critic or the
-            costs have another width than ``num_costs``.
+            ``"mean"`` or the discount of the costs is 1 without an ``episode_length``; in a
+            call, if the cost critic or the costs have another width than ``num_costs``.
 
     Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
     ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
@@ -155,6 +159,7 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
         *,
         num_costs: int = 1,
         sharpness: float = 20.0,
+        episode_length: float | None = None,
         cost_critic_coeff: float = 1.0,
         **kwargs: Any,
     ) -> None:
@@ -163,6 +168,7 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
             critic_network,
             cost_critic_network=cost_critic_network,
             num_costs=num_costs,
+            episode_length=episode_length,
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
@@ -170,5 +176,5 @@ class IPOLoss(CostSurrogateMixin, ClipPPOLoss):
         self.register_coeff_buffer("sharpness", sharpness, device=self.cost_critic_coeff.device)
 
     def _penalty(self, surrogate: Tensor) -> Tensor:
-        scale = 1 - self.cost_value_estimator.gamma
+        scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
         return scale * log_barrier(self.cost_violation + surrogate / scale, self.sharpness)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -28,8 +28,9 @@ class MultiplierUpdater(CostUpdater):
         loss_module (LossModule): a loss with a ``lagrange_multiplier`` buffer of shape ``(k,)``.
 
     Keyword Args:
-        cost_limit (float or Tensor): limit of each expected episode cost, one number or k, in
-            the unit of the undiscounted episode cost.
+        cost_limit (float, Tensor or Mapping): limit of each expected episode cost, one number,
+            k, or one by name, ``{"collision": 0.5, "speed": 2.0}``, in the unit of the
+            undiscounted episode cost.
         max_multiplier (float, optional): upper bound of every multiplier. Defaults to no bound.
         pessimism (float, optional): standard errors of the batch's mean episode cost that are
             added to it. A limit that binds is otherwise met on average only: policies end above
@@ -42,6 +43,9 @@ class MultiplierUpdater(CostUpdater):
             step that is proportional to the violation) change nothing else, and an early policy
             that violates the limit a hundred times over does not throw the multiplier out of
             reach. For costs that are never negative. Defaults to ``False``.
+        cost_names (sequence of str, optional): names of the k costs in their order, for example
+            ``env.cost_names``: those of limits by name, and those that errors and logs use.
+            Defaults to ``("0", "1", ...)``.
 
     Raises:
         ValueError: if the loss has no such buffer, or a limit, bound or pessimism is not usable.
@@ -50,12 +54,16 @@ class MultiplierUpdater(CostUpdater):
         >>> import torch
         >>> class Exponentiated(MultiplierUpdater):
         ...     def next_multiplier(self, multiplier, violation):
-        ...         return multiplier * violation.exp()
+        ...         # By a factor of 1.2 at most. The lower bound lets it start from 0.
+        ...         step = 0.2 * (violation / self.cost_limit).clamp(-1, 1)
+        ...         return multiplier.clamp_min(0.01) * step.exp()
         >>> loss = LossModule()
-        >>> loss.register_buffer("lagrange_multiplier", torch.ones(1))
-        >>> Exponentiated(loss, cost_limit=2.0, max_multiplier=2.5).step(torch.tensor([[3.0]]))
+        >>> loss.register_buffer("lagrange_multiplier", torch.zeros(1))
+        >>> updater = Exponentiated(loss, cost_limit=2.0, max_multiplier=10.0)
+        >>> for _ in range(5):
+        ...     updater.step(torch.tensor([[30.0]]))
         >>> loss.lagrange_multiplier
-        tensor([2.5000])
+        tensor([0.0272])
     """
 
     buffer_name = "lagrange_multiplier"
@@ -64,12 +72,15 @@ class MultiplierUpdater(CostUpdater):
         self,
         loss_module: LossModule,
         *,
-        cost_limit: float | Tensor,
+        cost_limit: float | Tensor | Mapping[str, float],
         max_multiplier: float | None = None,
         pessimism: float = 0.0,
         normalize: bool = False,
+        cost_names: Sequence[str] | None = None,
     ) -> None:
-        super().__init__(loss_module, cost_limit=cost_limit, pessimism=pessimism)
+        super().__init__(
+            loss_module, cost_limit=cost_limit, pessimism=pessimism, cost_names=cost_names
+        )
         if max_multiplier is not None and as_number(max_multiplier) != math.inf:
             max_multiplier = check_number("max_multiplier", max_multiplier, positive=True)
         if not isinstance(normalize, bool):
@@ -150,7 +161,7 @@ class DualAscent(MultiplierUpdater):
         loss_module (LossModule): see :class:`MultiplierUpdater`.
 
     Keyword Args:
-        cost_limit (float or Tensor): see :class:`MultiplierUpdater`.
+        cost_limit (float, Tensor or Mapping): see :class:`MultiplierUpdater`.
         lr (float): step size, in multiplier per unit of violated cost.
         max_multiplier (float, optional): see :class:`MultiplierUpdater`.
         pessimism (float, optional): see :class:`MultiplierUpdater`.
@@ -163,6 +174,7 @@ class DualAscent(MultiplierUpdater):
             ``torch.distributions.transforms.SoftplusTransform()``. As published, the gradient
             is that of the parameter times the violation, without the transform's derivative.
             Defaults to the identity: the multiplier itself.
+        cost_names (sequence of str, optional): see :class:`MultiplierUpdater`.
 
     Raises:
         ValueError: if ``lr`` is not positive, or ``parametrization`` cannot give the multiplier
@@ -173,7 +185,8 @@ class DualAscent(MultiplierUpdater):
         >>> from torchrl.objectives import LossModule
         >>> loss = LossModule()
         >>> loss.register_buffer("lagrange_multiplier", torch.zeros(2))
-        >>> updater = DualAscent(loss, cost_limit=torch.tensor([1.0, 5.0]), lr=0.5)
+        >>> limits = {"collision": 1.0, "speed": 5.0}
+        >>> updater = DualAscent(loss, cost_limit=limits, cost_names=["collision", "speed"], lr=0.5)
         >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 0.0]]))
         >>> loss.lagrange_multiplier
         tensor([1., 0.])
@@ -183,13 +196,14 @@ class DualAscent(MultiplierUpdater):
         self,
         loss_module: LossModule,
         *,
-        cost_limit: float | Tensor,
+        cost_limit: float | Tensor | Mapping[str, float],
         lr: float,
         max_multiplier: float | None = None,
         pessimism: float = 0.0,
         normalize: bool = False,
         optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.SGD,
         parametrization: Transform = identity_transform,
+        cost_names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(
             loss_module,
@@ -197,6 +211,7 @@ class DualAscent(MultiplierUpdater):
             max_multiplier=max_multiplier,
             pessimism=pessimism,
             normalize=normalize,
+            cost_names=cost_names,
         )
         lr = check_number("lr", lr, positive=True)
         multiplier = loss_module.lagrange_multiplier

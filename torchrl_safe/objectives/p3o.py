@@ -12,6 +12,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl_safe.objectives._checks import check_number
 from torchrl_safe.objectives._cost_critic import CostKeys
 from torchrl_safe.objectives._surrogate import CostSurrogateMixin
+from torchrl_safe.objectives.violation import per_step
 
 
 def exact_penalty(
@@ -71,14 +72,17 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
         num_costs (int, optional): number k of costs. Defaults to ``1``.
         penalty_coeff (float, optional): the factor :math:`\kappa`, in units of standardized
             reward advantage per cost advantage. Defaults to ``20.0``.
+        episode_length (float, optional): mean number of steps of an episode, to compare a
+            surrogate, which is about one step, with a violation, which is about an episode.
+            Defaults to :math:`1 / (1 - \gamma)`, as in the equation above.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
         ValueError: if ``num_costs`` or ``penalty_coeff`` is not positive, ``reduction`` is not
-            ``"mean"`` or the discount of the costs is 1; in a call, if the cost critic or the
-            costs have another width than ``num_costs``.
+            ``"mean"`` or the discount of the costs is 1 without an ``episode_length``; in a
+            call, if the cost critic or the costs have another width than ``num_costs``.
 
     Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
     ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
@@ -142,6 +146,7 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
         *,
         num_costs: int = 1,
         penalty_coeff: float = 20.0,
+        episode_length: float | None = None,
         cost_critic_coeff: float = 1.0,
         **kwargs: Any,
     ) -> None:
@@ -150,6 +155,7 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
             critic_network,
             cost_critic_network=cost_critic_network,
             num_costs=num_costs,
+            episode_length=episode_length,
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
@@ -158,5 +164,5 @@ class P3OLoss(CostSurrogateMixin, ClipPPOLoss):
         self.register_coeff_buffer("penalty_coeff", penalty_coeff, device=device)
 
     def _penalty(self, surrogate: Tensor) -> Tensor:
-        scale = 1 - self.cost_value_estimator.gamma
+        scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
         return exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -45,7 +46,7 @@ class PIDControl(MultiplierUpdater):
             integral starts.
 
     Keyword Args:
-        cost_limit (float or Tensor): see :class:`MultiplierUpdater`.
+        cost_limit (float, Tensor or Mapping): see :class:`MultiplierUpdater`.
         kp (float): proportional gain, in multiplier per unit of violated cost.
         ki (float): integral gain, in multiplier per unit of violated cost and batch.
         kd (float): derivative gain, in multiplier per unit of cost risen since the last batch.
@@ -56,6 +57,7 @@ class PIDControl(MultiplierUpdater):
         pessimism (float, optional): see :class:`MultiplierUpdater`.
         normalize (bool, optional): see :class:`MultiplierUpdater`. The gains are then per unit of
             normalized violation, whose rise it is that the derivative term answers.
+        cost_names (sequence of str, optional): see :class:`MultiplierUpdater`.
 
     Raises:
         ValueError: if a gain is negative or not finite, or ``smoothing`` is outside ``[0, 1)``.
@@ -80,7 +82,7 @@ class PIDControl(MultiplierUpdater):
         self,
         loss_module: LossModule,
         *,
-        cost_limit: float | Tensor,
+        cost_limit: float | Tensor | Mapping[str, float],
         kp: float,
         ki: float,
         kd: float,
@@ -88,6 +90,7 @@ class PIDControl(MultiplierUpdater):
         max_multiplier: float | None = None,
         pessimism: float = 0.0,
         normalize: bool = False,
+        cost_names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(
             loss_module,
@@ -95,6 +98,7 @@ class PIDControl(MultiplierUpdater):
             max_multiplier=max_multiplier,
             pessimism=pessimism,
             normalize=normalize,
+            cost_names=cost_names,
         )
         self.kp, self.ki, self.kd = (
             check_number(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd))

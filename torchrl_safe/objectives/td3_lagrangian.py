@@ -14,6 +14,10 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_safe.objectives._cost_q_critics import CostCriticsMixin
 
+# TorchRL makes a property of the list TD3Loss.out_keys when a TD3Loss itself is first created, and
+# select_out_keys needs the property, also in subclasses.
+TD3Loss.__new__(TD3Loss)
+
 
 class TD3LagrangianLoss(CostCriticsMixin, TD3Loss):
     r"""TD3 loss under constraints on k expected costs.

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import PPOLoss
 
+from torchrl_safe.objectives._actor import actor_distribution, importance_weight
 from torchrl_safe.objectives._cost_critic import CostKeys, get_or_raise
 from torchrl_safe.objectives._lagrange import MixedAdvantageMixin
 from torchrl_safe.objectives.violation import ViolationMixin
@@ -29,7 +30,7 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
     https://arxiv.org/abs/1705.10528, equation 10), and :meth:`cost_surrogate_loss` gives
     :math:`\mathrm{E}[w A_{c_i}]`. Nothing here bounds the policy's step: a
     :class:`~torchrl_safe.objectives.TrustRegionStep` moves the actor, an ordinary optimizer the
-    two critics on ``"loss_critic"`` and ``"loss_cost_critic"``. (TRPO without costs needs no
+    two critics on :meth:`critic_losses`. (TRPO without costs needs no
     more than :class:`~torchrl.objectives.PPOLoss`.)
 
     This class is a thin specialization of :class:`~torchrl.objectives.PPOLoss`, whose arguments,
@@ -109,7 +110,7 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
         >>> info = actor_step.step(data)
         >>> bool(info["kl"] <= 0.01)
         True
-        >>> losses = loss(data)
+        >>> losses = loss.critic_losses(data)
         >>> (losses["loss_critic"] + losses["loss_cost_critic"]).backward()
         >>> optimizer.step()
     """
@@ -158,10 +159,27 @@ class TrustRegionLoss(ViolationMixin, MixedAdvantageMixin, PPOLoss):
         """
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
         self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
-        log_weight, _, _, correction = self._log_weight(
-            tensordict.clone(False), adv_shape=cost_advantage.shape[:-1]
-        )
-        if correction is not None:
-            log_weight = log_weight + correction
-        surrogates = (log_weight.exp() * cost_advantage).split(1, -1)
+        distribution = actor_distribution(self, tensordict)
+        weight = importance_weight(self, distribution, tensordict, cost_advantage.shape[:-1])
+        surrogates = (weight * cost_advantage).split(1, -1)
         return torch.stack([self._reduce_loss(surrogate, tensordict) for surrogate in surrogates])
+
+    def critic_losses(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The losses of both critics, without the policy, which the step has already moved.
+
+        Args:
+            tensordict (TensorDictBase): data with the critics' inputs and value targets.
+
+        Returns:
+            ``"loss_critic"`` and ``"loss_cost_critic"``, those of a call of the loss, bit for
+            bit.
+
+        Raises:
+            KeyError: if a value target is missing.
+        """
+        losses = {"loss_cost_critic": self.loss_cost_critic(tensordict)[0]}
+        if self.critic_coeff is not None:
+            losses["loss_critic"] = self.loss_critic(tensordict.clone(False))[0]
+        return TensorDict(
+            {name: self._reduce_loss(loss, tensordict).squeeze(-1) for name, loss in losses.items()}
+        )

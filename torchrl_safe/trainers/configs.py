@@ -103,10 +103,15 @@ class CRPOLossConfig(WrappingLossConfig):
 
 @dataclass
 class UpdaterConfig(ConfigBase):
-    """What the configurations of updaters share: the trainer's loss is given to them later."""
+    """What the configurations of updaters share: the trainer's loss is given to them later.
+
+    With ``cost_names: [collision, speed]`` a limit goes by name,
+    ``cost_limit: {collision: 0.5, speed: 2.0}``.
+    """
 
     cost_limit: Any = MISSING
     pessimism: float = 0.0
+    cost_names: Any = None
     _convert_: str = "all"
     _partial_: bool = True
 

@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_safe.objectives._cost_updater import CostUpdater
+from torchrl_safe.objectives._cost_updater import CostUpdater, check_names
 
 
 class MultiplierHook(TrainerHookBase):
@@ -30,13 +30,15 @@ class MultiplierHook(TrainerHookBase):
         done_key (NestedKey, optional): read under ``"next"``, shape ``(*B, 1)``.
             Defaults to ``"done"``.
         cost_names (sequence of str, optional): names of the k costs for the logs, for example
-            ``env.cost_names``. Defaults to ``("0", "1", ...)``.
+            ``env.cost_names``. Defaults to those of the updater, which are
+            ``("0", "1", ...)`` by default.
 
     Raises:
         TypeError: if ``updater`` is no updater of :mod:`torchrl_safe.objectives`.
-        ValueError: if there is not one name for each cost; in :meth:`register`, if the trainer
-            trains another loss than the updater's or gives no batches to its hooks; in a call, if
-            the shapes of cost and done do not fit, or a cost is not finite.
+        ValueError: if there is not one name for each cost, or the updater has others; in
+            :meth:`register`, if the trainer trains another loss than the updater's or gives no
+            batches to its hooks; in a call, if the shapes of cost and done do not fit, or a cost
+            is not finite.
         KeyError: in a call, if the batch has no such key.
 
     Logged are, for each cost, ``"lagrange_multiplier/<name>"`` (after the step; for a
@@ -50,8 +52,9 @@ class MultiplierHook(TrainerHookBase):
         >>> from torchrl_safe.objectives import DualAscent
         >>> loss = LossModule()
         >>> loss.register_buffer("lagrange_multiplier", torch.zeros(1))
-        >>> updater = DualAscent(loss, cost_limit=1.0, lr=0.5)
-        >>> hook = MultiplierHook(updater, cost_names=["collision"])
+        >>> names = ["collision"]  # Of an environment: env.cost_names.
+        >>> limits = {"collision": 1.0}
+        >>> hook = MultiplierHook(DualAscent(loss, cost_limit=limits, cost_names=names, lr=0.5))
         >>> batch = TensorDict(
         ...     next=TensorDict(
         ...         episode_cost=torch.tensor([[2.0], [3.0], [9.0]]),
@@ -79,14 +82,14 @@ class MultiplierHook(TrainerHookBase):
         self.updater = updater
         self.episode_cost_key = unravel_key(("next", episode_cost_key))
         self.done_key = unravel_key(("next", done_key))
-        num_costs = len(self._buffer)
-        names = [str(index) for index in range(num_costs)] if cost_names is None else cost_names
-        if isinstance(names, str) or len(set(names)) != len(names) or len(names) != num_costs:
-            raise ValueError(
-                f"cost_names must be a different name for each of the {num_costs} costs, got "
-                f"{cost_names!r}."
-            )
-        self.cost_names = tuple(names)
+        self.cost_names = updater.cost_names
+        if cost_names is not None:
+            self.cost_names = check_names(cost_names, len(self._buffer))
+            if self.cost_names != updater.cost_names != check_names(None, len(self._buffer)):
+                raise ValueError(
+                    f"cost_names must be those of the updater, {updater.cost_names}, or be left "
+                    f"out, got {cost_names!r}."
+                )
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Steps the updater; the batch is returned as it is."""

@@ -8,7 +8,12 @@ action as ``torchrl_safe/<Arm><Task><Obstacles><Action>-v0``; the names are the 
 
 from itertools import product
 
-import gymnasium
+try:
+    import gymnasium
+except ImportError as error:
+    raise ImportError(
+        'torchrl_safe.envs.gym needs Gymnasium: pip install "torchrl-safe[arms]".'
+    ) from error
 
 from torchrl_safe.envs.gym.arm import ArmGymEnv
 from torchrl_safe.envs.gym.registered import ACTIONS, ARMS, OBSTACLES, TASKS, combination

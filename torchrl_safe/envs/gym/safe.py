@@ -6,6 +6,8 @@ Import from :mod:`torchrl_safe.envs.gym`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -228,6 +230,22 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
     def __init__(self, env_name: str, **kwargs: Any) -> None:
         super().__init__(env_name, **{"backend": "gymnasium", **kwargs})
 
+    @property
+    def lib(self) -> Any:
+        # All that TorchRL 0.14.1 takes from it is `make`.
+        return SimpleNamespace(make=partial(_make, super().lib))
+
     def _async_env(self, factories: Sequence[Callable[[], gymnasium.Env]]) -> AsyncVectorEnv:
         # In Gymnasium's default mode TorchRL 0.14.1 overwrites the last observations with zeros.
         return AsyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
+
+
+def _make(lib: Any, env_name: str, **kwargs: Any) -> gymnasium.Env:
+    try:
+        return lib.make(env_name, **kwargs)
+    except TypeError as error:
+        # TorchRL tries an argument of this name, and then without it if the error says so. A class
+        # without a constructor of its own says only that it takes none.
+        if "frameskip" in kwargs and "takes no arguments" in str(error):
+            raise TypeError("unexpected keyword argument 'frameskip'") from error
+        raise

@@ -1,0 +1,110 @@
+"""find_home: joint angles for a pose, and what stopped the search."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bullet_worlds import make_world
+from worlds import each_arm
+
+from torchrl_safe.envs import PANDA, UR5, XARM6, ArmEnv, NoObstacles, find_home
+
+DOWN = (1.0, 0.0, 0.0, 0.0)
+
+
+def pose_of(arm, angles):
+    world = make_world(arm)
+    position, orientation = world.tool_at(list(angles))
+    limits = world.joint_lower, world.joint_upper
+    world.close()
+    return np.array(position), np.array(orientation), limits
+
+
+@each_arm
+def test_a_guess_becomes_a_home(make_env, arm):
+    """Of elbow and wrist alike, and where the tool was to be."""
+    position, orientation, (lower, upper) = pose_of(arm, arm.home)
+    generator = np.random.default_rng(0)
+    for _ in range(3):
+        guess = np.array(arm.home) + generator.uniform(-0.3, 0.3, len(arm.home))
+        guess = np.clip(guess, lower + 0.01, upper - 0.01)
+        home = find_home(replace(arm, home=tuple(guess)), position, orientation)
+        there, turned, _ = pose_of(arm, home)
+        np.testing.assert_allclose(there, position, atol=1e-3)
+        assert abs(turned @ orientation) == pytest.approx(1, abs=1e-6)
+        np.testing.assert_array_equal(np.clip(home, lower, upper), home)
+        assert np.abs(np.subtract(home, guess)).max() < 1.0, "no other elbow"
+    env = make_env(ArmEnv, replace(arm, home=home), obstacles=NoObstacles())
+    env.reset()
+    np.testing.assert_allclose(env.arm_state.ee_position[0], position, atol=1e-3)
+
+
+@each_arm
+def test_home_is_its_own_home(arm):
+    position, orientation, _ = pose_of(arm, arm.home)
+    np.testing.assert_allclose(find_home(arm, position, orientation), arm.home, atol=1e-4)
+
+
+@each_arm
+def test_out_of_reach(arm):
+    with pytest.raises(
+        ValueError, match=r"got \[2.0, 0.0, 0.2\] and .* it is out of reach, ([\d.]+) m"
+    ):
+        find_home(arm, (2.0, 0.0, 0.2))
+
+
+def test_how_far_out_of_reach(turntable):
+    """The end of the bar goes round in a circle of 0.5 m, at a height of 0.5 m."""
+    with pytest.raises(ValueError, match=r"it is out of reach, 0\.300 m beyond"):
+        find_home(turntable["arm"], (0.8, 0.0, 0.5), (0, 0, 0, 1))
+
+
+def test_a_joint_limit(turntable):
+    """The bar turns by 1 rad to each side, and would have to by 1.5."""
+    angle = 1.5
+    position = (0.5 * np.cos(angle), 0.5 * np.sin(angle), 0.5)
+    orientation = (0, 0, np.sin(angle / 2), np.cos(angle / 2))
+    message = (
+        r"a joint limit stopped it: joint 1, counted from the base, would have to be at "
+        r"1\.500 rad and goes from -1\.000 to 1\.000"
+    )
+    with pytest.raises(ValueError, match=message):
+        find_home(turntable["arm"], position, orientation)
+    within = (0.5 * np.cos(0.9), 0.5 * np.sin(0.9), 0.5)
+    home = find_home(turntable["arm"], within, (0, 0, np.sin(0.45), np.cos(0.45)))
+    assert home == pytest.approx([0.9], abs=1e-3)
+
+
+def test_a_limit_of_an_arm():
+    """Behind the base, where a Panda's wrist would have to fold up."""
+    with pytest.raises(
+        ValueError, match=r"a joint limit stopped it: joint \d, counted from the base"
+    ):
+        find_home(PANDA, (0.0, 0.0, 0.05))
+
+
+@pytest.mark.parametrize(("arm", "position"), [(XARM6, (0.3, 0, 0.9)), (UR5, (0.3, 0, 0.9))])
+def test_a_singular_pose(arm, position):
+    """Above what the stretched arm reaches with its tool down, though not with its tool up."""
+    with pytest.raises(ValueError, match=r"a singular pose stopped it, \[.*Jacobian 0\.0\d\d\)"):
+        find_home(arm, position)
+
+
+def test_an_arm_with_too_few_joints(turntable):
+    """It never turns about anything but the vertical."""
+    with pytest.raises(ValueError, match=r"a singular pose stopped it, .*Jacobian 0\.000\)"):
+        find_home(turntable["arm"], (0.5, 0.0, 0.5), DOWN)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        (("panda", (0.4, 0, 0.2)), TypeError, "arm must be an instance of ArmModel, got 'panda'"),
+        ((PANDA, (0.4, 0)), ValueError, r"position must have shape \(3,\), got \(2,\)"),
+        ((PANDA, (0.4, 0, np.nan)), ValueError, "position must be finite"),
+        ((PANDA, (0.4, 0, 0.2), (1, 1, 0, 0)), ValueError, "orientation must be a unit quaternion"),
+    ],
+)
+def test_bad_arguments(arguments, kind, message):
+    with pytest.raises(kind, match=message):
+        find_home(*arguments)

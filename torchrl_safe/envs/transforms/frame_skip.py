@@ -1,0 +1,61 @@
+"""Repeated actions in environments with costs."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import FrameSkipTransform
+
+from torchrl_safe._checks import check_count
+
+
+class FrameSkip(FrameSkipTransform):
+    """Repeats each action, and sums every reward of the environment, so costs too.
+
+    TorchRL's :class:`~torchrl.envs.FrameSkipTransform`, for environments with more than one
+    reward, for which that raises a KeyError. It also steps on where an episode has ended: here a
+    row keeps its first ``done`` and what came with it, and nothing after that counts.
+    :class:`~torchrl_safe.envs.ArmEnv` needs neither: its own ``frame_skip`` is cheaper.
+
+    Args:
+        frame_skip (int, optional): how often an action is taken. Defaults to ``1``.
+
+    Raises:
+        ValueError: if ``frame_skip`` is not a whole number of at least 1.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> env = TransformedEnv(ArmEnv(num_envs=2), FrameSkip(4))
+        >>> rollout = env.rollout(20)  # Of 40 steps, which is when the time is up.
+        >>> rollout.shape, rollout["next", "truncated"].sum(1).flatten().tolist()
+        (torch.Size([2, 10]), [1, 1])
+        >>> env.close()
+    """
+
+    def __init__(self, frame_skip: int = 1) -> None:
+        check_count(frame_skip=frame_skip)
+        super().__init__(frame_skip)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if (parent := self.parent) is None:
+            raise RuntimeError("FrameSkip repeats the steps of an environment: append it to one.")
+        for _ in range(self.frame_skip - 1):
+            over = _is_over(next_tensordict)
+            if over.all():
+                break
+            after = parent._step(tensordict)
+            for key in parent.reward_keys:
+                after.set(key, next_tensordict.get(key) + after.get(key))
+            next_tensordict = next_tensordict.where(over, after)
+        return next_tensordict
+
+
+def _is_over(tensordict: TensorDictBase) -> Tensor:
+    """Which of the environments have ended their episode, of the tensordict's shape."""
+    flags = [tensordict.get(key, None) for key in ("done", "terminated", "truncated")]
+    ends = [flag.reshape(tensordict.shape) for flag in flags if flag is not None]
+    if not ends:
+        raise KeyError("FrameSkip needs 'done' of the whole environment, not of its agents.")
+    return torch.stack(ends).any(0)

@@ -1,0 +1,146 @@
+"""Plays whole episodes with a policy, and puts confidence intervals on what they show.
+
+Needs SciPy: ``pip install "torchrl-safe[metrics]"``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_safe._checks import check_count
+from torchrl_safe.metrics import mean, share, violation_rate
+
+__all__ = ["evaluate", "summarize"]
+
+
+@torch.no_grad()
+def evaluate(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    episodes: int,
+    *,
+    seed: int,
+    max_steps: int = 10_000,
+) -> TensorDict:
+    """Plays episodes with the deterministic policy.
+
+    Each environment of a batch plays one episode from start to end, as often as needed. (The first
+    episodes to end, which TorchRL's ``Evaluator`` takes, are the short ones.)
+
+    Args:
+        env (EnvBase): environment, batched or not, with a ``reward`` and a ``cost``. A cost that
+            is an observation becomes one with :class:`~torchrl_safe.envs.CostToReward`.
+        policy (callable): the policy: the actor that you train, or ``load_policy(...).actor``.
+        episodes (int): how many episodes to play at least. A batch of environments plays all the
+            episodes that it begins.
+
+    Keyword Args:
+        seed (int): seed of the episodes. With the same seed every policy meets the same episodes.
+        max_steps (int, optional): steps in which every episode must end. Defaults to ``10_000``.
+
+    Returns:
+        A TensorDict of shape ``(E,)`` with, for each episode, ``episode_reward`` of shape
+        ``(E, 1)``, ``episode_cost`` ``(E, k)``, ``steps`` ``(E, 1)``, and ``success`` ``(E, 1)`` if
+        the environment has it. The sums are the environment's own if it has ``episode_reward``
+        or ``episode_cost`` (:class:`~torchrl.envs.RewardSum`).
+
+    Raises:
+        ValueError: if the environment has no cost or no reward, or an episode has not ended after
+            ``max_steps``.
+
+    Examples:
+        >>> from torchrl.envs.utils import RandomPolicy
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> env = ArmEnv(num_envs=2, max_episode_steps=3)
+        >>> episodes = evaluate(env, RandomPolicy(env.action_spec), 4, seed=0)
+        >>> episodes["steps"].squeeze(-1)
+        tensor([3, 3, 3, 3])
+        >>> figures = summarize(episodes, env.cost_names)
+        >>> list(figures)
+        ['success', 'return', 'steps', 'cost/collision', 'any/collision']
+    """
+    check_count(episodes=episodes, max_steps=max_steps)
+    names = list(env.full_observation_spec.keys()) + list(env.full_reward_spec.keys())
+    for name in ("reward", "cost"):
+        if name not in names and f"episode_{name}" not in names:
+            raise ValueError(f"env must have the key {name!r} or 'episode_{name}', got {names}.")
+    rounds = []
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(math.ceil(episodes / env.batch_size.numel())):
+            seed = env.set_seed(seed)
+            rounds.append(_play(env, policy, max_steps))
+    return torch.cat(rounds)
+
+
+def summarize(
+    episodes: TensorDictBase, cost_names: Sequence[str] | None = None
+) -> dict[str, list[float]]:
+    """Returns each figure of the episodes with the ends of its 95 % confidence interval.
+
+    The figures are ``return``, ``steps``, ``success``, and for each cost its mean (``cost/name``)
+    and the share of episodes with any of it (``any/name``). Shares have Wilson's interval, means
+    that of the percentile bootstrap.
+
+    Args:
+        episodes (TensorDictBase): what :func:`evaluate` returns.
+        cost_names (sequence of str, optional): names of the costs, such as ``env.cost_names``.
+            Defaults to their numbers.
+
+    Returns:
+        Estimate, lower and upper end, by name of the figure.
+
+    Raises:
+        ValueError: if there is not one name for each cost.
+    """
+    costs = episodes["episode_cost"]
+    names = map(str, range(costs.shape[-1])) if cost_names is None else cost_names
+    names = tuple(names)
+    if len(names) != costs.shape[-1]:
+        raise ValueError(
+            f"cost_names must be one for each of the {costs.shape[-1]} costs, got {names}."
+        )
+    success = episodes.get("success", None)
+    estimates = {} if success is None else {"success": share(success)}
+    estimates["return"] = mean(episodes["episode_reward"])
+    estimates["steps"] = mean(episodes["steps"])
+    for name, column in zip(names, costs.split(1, -1), strict=True):
+        estimates[f"cost/{name}"] = mean(column)
+        estimates[f"any/{name}"] = violation_rate(column, 0.0)
+    return {name: torch.cat(estimate).tolist() for name, estimate in estimates.items()}
+
+
+def _play(
+    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], max_steps: int
+) -> TensorDictBase:
+    """One episode in each environment of a batch, until the last of them has ended."""
+    tensordict = env.reset()
+    running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
+    figures: TensorDictBase | None = None
+    for step in range(1, max_steps + 1):
+        played, tensordict = env.step_and_maybe_reset(policy(tensordict))
+        current = _figures(played["next"], figures)
+        current["steps"] = torch.full((*env.batch_size, 1), step, device=env.device)
+        figures = current if figures is None else current.where(running, figures)
+        running &= ~played["next", "done"].squeeze(-1)
+        if not running.any():
+            return figures.reshape(-1)
+    raise ValueError(
+        f"max_steps must let every episode end, got {max_steps}, after which "
+        f"{int(running.sum())} of {running.numel()} go on."
+    )
+
+
+def _figures(after: TensorDictBase, before: TensorDictBase | None) -> TensorDictBase:
+    """Sums of reward and cost up to a step, and whether it was a success."""
+    figures = after.select("success", "episode_reward", "episode_cost", strict=False).clone()
+    for name in ("reward", "cost"):
+        total = f"episode_{name}"
+        if total not in figures:
+            figures[total] = after[name] if before is None else before[total] + after[name]
+    return figures

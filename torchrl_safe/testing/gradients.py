@@ -1,0 +1,278 @@
+"""What a constrained loss trains, in which direction, and on which steps and costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_safe.testing._losses import (
+    Constrain,
+    MakeData,
+    MakeLoss,
+    MakeNetworks,
+    build,
+    call,
+    loss_keys,
+    named,
+    require,
+    require_close,
+    require_same_outputs,
+    set_multiplier,
+    total,
+)
+from torchrl_safe.testing.batches import make_minibatch
+from torchrl_safe.testing.networks import make_networks as make_default_networks
+
+
+def check_gradients(
+    make_loss: MakeLoss,
+    trains: Mapping[str, str] | None = None,
+    *,
+    num_costs: int = 2,
+    make_networks: MakeNetworks = make_default_networks,
+    make_data: MakeData = make_minibatch,
+    constrain: Constrain = set_multiplier,
+) -> None:
+    """Checks that each ``loss_*`` output trains one network, and that each network is trained.
+
+    Args:
+        make_loss (callable): see :func:`check_equals_at_zero`.
+        trains (mapping, optional): which network each output trains, for example
+            ``{"loss_cost_critic": "cost_critic"}``. Networks are named as in the parameters of
+            the loss, without ``_network_params``; outputs that are not named here may train any.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs.
+        make_networks (callable, optional): see :func:`check_equals_at_zero`.
+        make_data (callable, optional): see :func:`check_equals_at_zero`.
+        constrain (callable, optional): see :func:`check_equals_at_zero`.
+
+    Raises:
+        AssertionError: if an output reaches no network, several, or another one than ``trains``
+            says.
+
+    Examples:
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> check_gradients(PPOLagrangianLoss, {"loss_cost_critic": "cost_critic"})
+    """
+    loss = build(make_loss, make_networks, num_costs)
+    constrain(loss, torch.ones(num_costs))
+    losses = call(loss, make_data(num_costs))
+    keys, every = loss_keys(losses), set()
+    for name in [*losses.keys()]:
+        trained = isinstance(losses[name], Tensor) and losses[name].requires_grad
+        require(
+            trained == (name in keys),
+            f"{named(loss)}: output {name!r} {'has a' if trained else 'has no'} gradient",
+        )
+    for key in keys:
+        loss.zero_grad()
+        losses[key].sum().backward(retain_graph=True)
+        reached = {
+            name.split("_network")[0].split(".")[-1]
+            for name, parameter in loss.named_parameters()
+            if parameter.grad is not None and parameter.grad.any()
+        }
+        require(
+            len(reached) == 1,
+            f"{named(loss)}: output {key!r} must train one network, trains {sorted(reached)}",
+        )
+        wanted = {(trains or {}).get(key, *reached)}
+        require(
+            reached == wanted,
+            f"{named(loss)}: output {key!r} must train {wanted}, trains {reached}",
+        )
+        every |= reached
+    loss.zero_grad()
+    networks = {name.split("_network")[0].split(".")[-1] for name, _ in loss.named_parameters()}
+    require(
+        every == networks,
+        f"{named(loss)}: no output trains {sorted(networks - every)}, only {sorted(every)}",
+    )
+
+
+def check_masked_steps(
+    make_loss: MakeLoss,
+    *,
+    num_costs: int = 2,
+    make_networks: MakeNetworks = make_default_networks,
+    make_data: MakeData = make_minibatch,
+    constrain: Constrain = set_multiplier,
+) -> None:
+    """Checks that steps which a mask leaves out count nowhere in the ``loss_*`` outputs.
+
+    The mask is TorchRL's ``("collector", "mask")``. What the masked steps hold must have no
+    effect; and if the loss draws no random numbers, its outputs must be those of the data without
+    these steps.
+
+    Args:
+        make_loss (callable): see :func:`check_equals_at_zero`.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs.
+        make_networks (callable, optional): see :func:`check_equals_at_zero`.
+        make_data (callable, optional): see :func:`check_equals_at_zero`.
+        constrain (callable, optional): see :func:`check_equals_at_zero`.
+
+    Raises:
+        AssertionError: if a masked step counts.
+
+    Examples:
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> check_masked_steps(PPOLagrangianLoss)
+    """
+
+    def run(data: TensorDictBase, seed: int = 7) -> TensorDictBase:
+        # A new loss for each call: some, as KLPENPPOLoss, change a coefficient in a call.
+        loss = build(make_loss, make_networks, num_costs)
+        constrain(loss, torch.ones(num_costs))
+        losses = call(loss, data, seed=seed)
+        return losses.select(*loss_keys(losses))
+
+    data = make_data(num_costs)
+    kept = torch.arange(len(data)) % 3 != 0
+    masked = data.clone().set(("collector", "mask"), kept.unsqueeze(-1))
+    odd = masked.clone()
+    for key in odd.keys(True, True):
+        last = key if isinstance(key, str) else key[-1]
+        if last in ("reward", "cost") or last.endswith(("advantage", "value_target")):
+            odd[key][~kept] = 1e3
+    expected = run(masked)
+    require_same_outputs(
+        "what the masked steps hold has an effect", run(odd), expected, exact=False
+    )
+    one, other = run(data, seed=1), run(data, seed=2)
+    if all(torch.equal(value, other[key]) for key, value in one.items()):
+        require_same_outputs("masked steps count", expected, run(data[kept]), exact=False)
+
+
+def check_num_costs(
+    make_loss: MakeLoss,
+    *,
+    num_costs: int = 3,
+    make_networks: MakeNetworks = make_default_networks,
+    make_data: MakeData = make_minibatch,
+    constrain: Constrain = set_multiplier,
+) -> None:
+    """Checks that each of k costs of an on-policy loss acts through its own column.
+
+    With one cost under constraint and the others not, the gradient of the policy must be that of
+    a loss that knows this cost alone; and the targets of every cost must count for its critic.
+
+    Args:
+        make_loss (callable): see :func:`check_equals_at_zero`.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs.
+        make_networks (callable, optional): see :func:`check_equals_at_zero`.
+        make_data (callable, optional): see :func:`check_equals_at_zero`.
+            The entries of the costs are those whose name begins with ``cost``.
+        constrain (callable, optional): see :func:`check_equals_at_zero`.
+
+    Raises:
+        AssertionError: if a cost acts through another column, or through none.
+
+    Examples:
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> check_num_costs(PPOLagrangianLoss)
+    """
+    data = make_data(num_costs)
+    for index in range(num_costs):
+        alone = data.clone()
+        for key in list(alone.keys(True, True)):
+            if (key if isinstance(key, str) else key[-1]).startswith("cost"):
+                alone[key] = alone[key][..., index : index + 1]
+        strength = torch.zeros(num_costs)
+        strength[index] = 0.7
+        gradients = [
+            _policy_gradient(make_loss, make_networks, constrain, each, values)[1]
+            for each, values in ((data, strength), (alone, strength[index : index + 1]))
+        ]
+        require_close(
+            f"cost {index} of {num_costs} does not act on the policy as it does alone", *gradients
+        )
+        moved = data.clone()
+        moved["cost_value_target"][..., index] += 10.0
+        loss, _ = _policy_gradient(make_loss, make_networks, constrain, data, strength)
+        before, after = (total(call(loss, each)) for each in (data, moved))
+        require(
+            bool(after != before),
+            f"{named(loss)}: the target of cost {index} has no effect on any loss",
+        )
+
+
+def check_multiplier_direction(
+    make_loss: MakeLoss,
+    *,
+    num_costs: int = 2,
+    make_networks: MakeNetworks = make_default_networks,
+    make_data: MakeData = make_minibatch,
+    constrain: Constrain = set_multiplier,
+) -> None:
+    r"""Checks that a multiplier moves the policy of an on-policy loss towards less of its cost.
+
+    For data of the policy itself, a step against the gradient of a loss with a large multiplier
+    must lower the cost's surrogate :math:`E[\pi(a|s) / \pi_{old}(a|s) A_c]`, and must be nearer
+    to its steepest descent than the step without a multiplier.
+
+    Args:
+        make_loss (callable): see :func:`check_equals_at_zero`.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs.
+        make_networks (callable, optional): see :func:`check_equals_at_zero`.
+        make_data (callable, optional): see :func:`check_equals_at_zero`.
+            The data have ``action`` and ``cost_advantage`` under these names.
+        constrain (callable, optional): see :func:`check_equals_at_zero`.
+
+    Raises:
+        AssertionError: if a multiplier pushes the wrong way, or not at all.
+
+    Examples:
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> check_multiplier_direction(PPOLagrangianLoss)
+    """
+    actor, _, _ = make_networks(num_costs, seed=0, keys={})
+    data = make_data(num_costs)
+    with torch.no_grad():  # So that no ratio is clipped, and no old policy is far.
+        data = call(actor, data)
+    log_prob = actor.get_dist(data.clone()).log_prob(data["action"])
+    surrogate = ((log_prob - log_prob.detach()).exp().unsqueeze(-1) * data["cost_advantage"]).mean(
+        0
+    )
+    for index in range(num_costs):
+        parts = torch.autograd.grad(surrogate[index], [*actor.parameters()], retain_graph=True)
+        uphill = torch.cat([part.flatten() for part in parts])
+        cosines = []
+        for size in (0.0, 100.0):
+            strength = torch.zeros(num_costs)
+            strength[index] = size
+            loss, gradient = _policy_gradient(make_loss, make_networks, constrain, data, strength)
+            cosines.append(torch.cosine_similarity(gradient, uphill, dim=0).item())
+        require(
+            cosines[1] > max(0.0, cosines[0]),
+            f"{named(loss)}: with multiplier 100 for cost {index} a step must lower this cost; the "
+            f"cosine of its gradient and the loss's is {cosines[1]:.3f} with the multiplier, "
+            f"{cosines[0]:.3f} without",
+        )
+
+
+def _policy_gradient(
+    make_loss: MakeLoss,
+    make_networks: MakeNetworks,
+    constrain: Constrain,
+    data: TensorDictBase,
+    strength: Tensor,
+) -> tuple[LossModule, Tensor]:
+    """A loss under constraint, and the gradient of the sum of its losses by the policy."""
+    num_costs = len(strength)
+    networks = make_networks(num_costs, seed=0, keys={})
+    loss = make_loss(*networks, num_costs=num_costs)
+    constrain(loss, strength)
+    parameters = list(networks[0].parameters())
+    gradients = torch.autograd.grad(total(call(loss, data)), parameters)
+    return loss, torch.cat([gradient.flatten() for gradient in gradients])
