@@ -14,7 +14,7 @@ except (ImportError, AttributeError) as _error:
     _reason = (
         f"MuJoCo does not load, see the variable MUJOCO_GL: {_error}."
         if isinstance(_error, AttributeError)
-        else 'MuJoCo 4 is not installed: pip install "torchrl-safe[mujoco]" (Python 3.11 or newer).'
+        else 'physics=MuJoCo() needs MuJoCo 4: pip install "torchrl-safe[mujoco]"'
     )
 
     class _Missing:

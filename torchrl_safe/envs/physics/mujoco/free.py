@@ -42,7 +42,9 @@ class FreeBodies:
 
     def read(self, qpos: Array, qvel: Array) -> Ways:
         """Returns their poses and velocities, each ``(..., b, width)``."""
-        poses, moves = qpos[..., self._position], qvel[..., self._velocity]
-        orientation = poses[..., 3:][..., _TO_OURS]
+        # Other ways of indexing lay the numbers out anew, and the last bit of what is computed with
+        # them depends on that.
+        poses, moves = qpos.take(self._position, axis=-1), qvel.take(self._velocity, axis=-1)
+        orientation = poses[..., 3:].take(_TO_OURS, axis=-1)
         # MuJoCo tells the angular velocity in the frame of the body.
         return Ways(poses[..., :3], orientation, moves[..., :3], turn(orientation, moves[..., 3:]))

@@ -72,7 +72,7 @@ def build_world(
     model = spec.compile()
     ids = [model.joint(name).id for name in parts.joints + parts.fingers]
     velocity = model.jnt_dofadr[ids]
-    set_gains(model, parts, np.diag(mass)[velocity])
+    set_gains(model, np.diag(mass)[velocity])
     return World(
         model=model,
         parts=parts,

@@ -15,8 +15,10 @@ from torchrl_safe.envs.state import Array
 # substep; with more, motors at the end of their efforts, which MuJoCo does not treat implicitly,
 # would chatter.
 _RATE = 0.5 / SUBSTEP
-# Of fingers, N/m and N s/m: stiff enough to hold what they hold with all their effort.
-_FINGER_STIFFNESS, _FINGER_DAMPING = 1e4, 500.0
+# Fingers press with all their effort what keeps them this far from where they are to be, m.
+_SQUEEZE = 0.005
+# The effort of fingers that have no limit, N.
+_FINGER_EFFORT = 20.0
 #: The group of the fingers' motors, which rest where an action moves no fingers.
 FINGER_GROUP = 1
 
@@ -42,22 +44,23 @@ def add_motors(spec: Any, parts: ArmParts, *, limited: bool) -> None:
             else:
                 motor.set_to_velocity(kv=1.0)
     for name, effort in zip(names, parts.effort.tolist(), strict=True):
+        joint = spec.joint(name)
         if limited and np.isfinite(effort):
-            joint = spec.joint(name)
             joint.actfrclimited, joint.actfrcrange = True, (-effort, effort)
+        if name in parts.fingers:
+            # What is as stiff as that at the rate of the others: as if the motor had a gear.
+            strength = effort if np.isfinite(effort) else _FINGER_EFFORT
+            joint.armature = strength / _SQUEEZE / _RATE**2
 
 
-def set_gains(model: Any, parts: ArmParts, mass: Array) -> None:
+def set_gains(model: Any, mass: Array) -> None:
     """Makes the servos of each joint critically damped for what it has to move at home.
 
     Args:
         model: the compiled world; changed in place.
-        parts: of the arm.
         mass: the diagonal of the mass matrix for joints and fingers, kg m^2 and kg.
     """
-    joints, count = len(parts.joints), len(mass)
-    stiffness, damping = mass * _RATE**2, 2 * mass * _RATE
-    stiffness[joints:], damping[joints:] = _FINGER_STIFFNESS, _FINGER_DAMPING
+    count, stiffness, damping = len(mass), mass * _RATE**2, 2 * mass * _RATE
     position, velocity = slice(0, count), slice(count, 2 * count)
     model.actuator_gainprm[position, 0] = stiffness
     model.actuator_biasprm[position, 1] = -stiffness

@@ -135,7 +135,7 @@ class MuJoCoSimulator:
         """Takes a control step towards joint targets ``(N, n)`` and finger targets ``(N, f)``."""
         tracks = self._tracks
         self._hold_absent()
-        current = self._qpos[:, self._driven]
+        current = self._qpos.take(self._driven, axis=1)
         targets = current.copy()
         targets[:, : joints.shape[1]] = joints
         if fingers.shape[1]:
@@ -260,7 +260,7 @@ class MuJoCoSimulator:
             if name in places:
                 trace[name] = touch_distance(places[name].of(contacts))
         if sensing.joints:
-            trace["joint_position"] = qpos[..., self._driven[: len(self.joint_lower)]]
+            trace["joint_position"] = qpos.take(self._driven[: len(self.joint_lower)], axis=-1)
         if sensing.tool:
             trace |= {
                 name: places[name].of(after).copy() for name in ("ee_position", "ee_velocity")
@@ -280,7 +280,7 @@ class MuJoCoSimulator:
 
     def _tool(self) -> tuple[Array, ToolPose]:
         if self._pose is None:
-            joints = self._qpos[:, self._driven[: len(self.joint_lower)]]
+            joints = self._qpos.take(self._driven[: len(self.joint_lower)], axis=1)
             self._pose = joints, self._chain(joints)
         return self._pose
 
@@ -288,14 +288,14 @@ class MuJoCoSimulator:
         """Returns the state of all worlds."""
         count = len(self.joint_lower)
         joints, tool = self._tool()
-        speed = self._qvel[:, self._driven_speed[:count]]
+        speed = self._qvel.take(self._driven_speed[:count], axis=1)
         obstacles, objects = self._obstacles(), self._objects.read(self._qpos, self._qvel)
         return ArmState(
             joint_position=joints,
             joint_velocity=speed,
             joint_lower=self.joint_lower,
             joint_upper=self.joint_upper,
-            finger_position=self._qpos[:, self._driven[count:]],
+            finger_position=self._qpos.take(self._driven[count:], axis=1),
             ee_position=tool.position,
             ee_orientation=tool.orientation,
             ee_velocity=(tool.jacobian[:, :3] @ speed[:, :, None])[:, :, 0],
