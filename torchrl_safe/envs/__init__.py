@@ -48,6 +48,7 @@ from torchrl_safe.envs.obstacles import (
 )
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS, paper_env
 from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
+from torchrl_safe.envs.physics.mujoco import MuJoCo
 from torchrl_safe.envs.physics.scene import Camera, Scene
 from torchrl_safe.envs.physics.simulator import Physics, Simulator
 from torchrl_safe.envs.regions import NoRoomError, Region
@@ -92,6 +93,7 @@ __all__ = [
     "JointLimit",
     "Motion",
     "Moving",
+    "MuJoCo",
     "NoObstacles",
     "NoRoomError",
     "Obstacles",
