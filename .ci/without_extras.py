@@ -37,7 +37,7 @@ def refused(use, extra):
 package = files("torchrl_safe")
 assert "site-packages" in str(package), package
 assert (package / "py.typed").is_file()
-assert (package / "envs" / "gripper.urdf").is_file()
+assert (package / "envs" / "arms" / "gripper.urdf").is_file()
 assert torchrl_safe.__version__
 
 refused(ArmEnv, "arms")

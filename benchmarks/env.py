@@ -87,7 +87,7 @@ def episode(env: EnvBase, steps: int) -> Contender:
 
 def floor(env: ArmEnv, steps: int) -> Contender:
     """The physics of :func:`rollout` alone, on the same worlds."""
-    tape, policy = Tape(env.num_envs), Canned(env, steps)
+    tape, policy = Tape(), Canned(env, steps)
     env.set_seed(0)
     start = env.reset()
     with tape.recording():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from time import process_time
 from typing import Any
 from unittest import mock
@@ -17,16 +18,12 @@ class Tape:
     """Records an environment's motor commands and physics steps, and plays them again.
 
     Played from the state that the environment was in, the worlds move as they have moved: the
-    floor is that of an arm in motion.
-
-    Args:
-        num_envs: number of worlds.
+    floor is that of an arm in motion. The commands are sent in between, but not timed.
     """
 
-    def __init__(self, num_envs: int) -> None:
-        self._num_envs = num_envs
-        self._commands: list[tuple[Call, tuple[Any, ...], dict[str, Any]]] = []
-        self._clients: list[int] = []
+    def __init__(self) -> None:
+        # Commands as calls, each before the client numbers of the steps that follow it.
+        self._tape: list[tuple[Call, list[int]]] = []
 
     @contextmanager
     def recording(self) -> Iterator[None]:
@@ -34,11 +31,11 @@ class Tape:
         command, step = pybullet.setJointMotorControlArray, pybullet.stepSimulation
 
         def record_command(*args: Any, **kwargs: Any) -> None:
-            self._commands.append((command, args, kwargs))
+            self._tape.append((partial(command, *args, **kwargs), []))
             command(*args, **kwargs)
 
         def record_step(physicsClientId: int) -> None:  # noqa: N803
-            self._clients.append(physicsClientId)
+            self._tape[-1][1].append(physicsClientId)
             step(physicsClientId=physicsClientId)
 
         with (
@@ -49,13 +46,9 @@ class Tape:
 
     def play(self) -> float:
         """Sends all again and returns the seconds of the physics steps alone."""
-        control_steps = len(self._commands) // self._num_envs
-        commands, steps = self._num_envs, len(self._clients) // control_steps
         step, seconds = pybullet.stepSimulation, 0.0
-        for index in range(control_steps):
-            for send, args, kwargs in self._commands[commands * index : commands * (index + 1)]:
-                send(*args, **kwargs)
-            clients = self._clients[steps * index : steps * (index + 1)]
+        for send, clients in self._tape:
+            send()
             start = process_time()
             for client in clients:
                 step(physicsClientId=client)

@@ -29,6 +29,7 @@ AlgorithmName = Literal[
     "sac-lagrangian",
     "td3-lagrangian",
 ]
+Engine = Literal["bullet", "mujoco"]
 MultiplierRule = Literal["dual-ascent", "pid", "fixed"]
 #: The algorithms that learn from replay; they need bounded actions.
 OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
@@ -46,6 +47,8 @@ class Config:
     """What an action moves: the tool point, by inverse kinematics, or each joint."""
     observation: Observation = "full"
     """What the policy sees: all that moves, or the paper's eight numbers."""
+    physics: Engine = "bullet"
+    """Engine that simulates the arm; mujoco is several times as fast, and needs that extra."""
     paper: bool = False
     """Train in the paper's environment: its Panda, obstacle and actions, at 240 Hz."""
     algorithms: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
@@ -122,10 +125,10 @@ class Config:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
-        if self.paper and (self.arm, self.obstacles) != (Config.arm, Config.obstacles):
-            raise ValueError(
-                f"paper has an arm and an obstacle of its own, got {self.arm} and {self.obstacles}."
-            )
+        for name in ("arm", "obstacles", "physics"):
+            value, own = getattr(self, name), getattr(Config, name)
+            if self.paper and value != own:
+                raise ValueError(f"{name} must be {own} with paper, got {value}.")
         for name in self.algorithms:
             if self.paper and name in OFF_POLICY:
                 raise ValueError(

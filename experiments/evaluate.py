@@ -24,7 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from experiments import train
 from experiments.agent import num_costs
-from experiments.config import Config as TrainConfig
+from experiments.config import Config as TrainConfig, Engine
 from experiments.report import figures_table, save_animation
 from torchrl_safe.envs import ArmEnv
 from torchrl_safe.evaluation import evaluate, summarize
@@ -45,6 +45,8 @@ class Config:
     """An environment of your own, as module:function. Called as function(num_envs=...), it
     returns an ArmEnv, or any environment with reward and cost. Without it, the environment that
     make train trained in."""
+    physics: Engine | None = None
+    """Engine that simulates the arm; by default that of the training."""
     episodes: int = 256
     """Episodes to play at least, with the deterministic policy."""
     envs: int = 32
@@ -56,7 +58,7 @@ class Config:
     cost_limits: tuple[float, ...] = ()
     """Limit of each cost of an episode; by default those of the training."""
     gui: bool = False
-    """Show some episodes in PyBullet's window, in real time. Needs a screen."""
+    """Show some episodes in a window, in real time. Needs a screen, and physics bullet."""
     video: Path | None = None
     """Film some episodes of an arm into this file, .gif or .webp, at half speed."""
     shown: int = 4
@@ -72,6 +74,11 @@ class Config:
             raise ValueError(f"cost_limits must not be negative, got {self.cost_limits}.")
         if self.video is not None and self.video.suffix not in (".gif", ".webp"):
             raise ValueError(f"video must end in .gif or .webp, got {str(self.video)!r}.")
+        if self.physics is not None and self.env is not None:
+            raise ValueError(
+                f"physics must not be given with env, got {self.physics} and {self.env!r}: choose it "
+                "there."
+            )
         if self.gui and self.env is not None:
             raise ValueError(f"gui must not be given with env, got {self.env!r}: open it there.")
 
@@ -85,6 +92,8 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
                 f"env must be given for a policy that was trained in {saved.settings['env']}."
             )
         known = {name: saved.settings[name] for name in _ENVIRONMENT}
+        # Policies of before there was a choice were trained with Bullet.
+        known["physics"] = config.physics or saved.settings.get("physics", "bullet")
         algorithm = saved.settings["name"]
         return partial(
             train.make_env, TrainConfig(**known, algorithms=(algorithm,)), algorithm=algorithm

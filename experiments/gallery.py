@@ -10,6 +10,8 @@ import matplotlib.pyplot as plt
 import tyro
 from tqdm import tqdm
 
+from experiments.config import Engine
+from experiments.train import PHYSICS
 from torchrl_safe.envs import ArmEnv, Camera
 from torchrl_safe.envs.gym import ARMS, OBSTACLES, TASKS, combination
 
@@ -23,6 +25,8 @@ class Config:
 
     arms: tuple[str, ...] = tuple(ARMS)
     """Which arms, by their names in torchrl_safe.envs.gym.ARMS."""
+    physics: Engine = "bullet"
+    """Engine that simulates and draws them."""
     out: Path = Path("runs/gallery.png")
     """File of the picture."""
     width: int = 200
@@ -47,7 +51,8 @@ def main(config: Config) -> None:
     tiles = list(product(enumerate(rows), enumerate(config.arms)))
     for (row, (task, obstacles)), (column, arm) in tqdm(tiles, desc="gallery", unit="tile"):
         axis = grid[row][column]
-        env = ArmEnv(**combination(arm, task, obstacles, ""), seed=config.seed)
+        parts = combination(arm, task, obstacles, "")
+        env = ArmEnv(**parts, physics=PHYSICS[config.physics], seed=config.seed)
         env.rollout(config.steps, lambda td: td.set("action", env.action_spec.zero()))  # noqa: B023
         axis.imshow(env.render(config.width, height, CAMERA)[0].numpy())
         env.close()

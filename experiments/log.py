@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import fmean
 from time import perf_counter
@@ -99,4 +100,8 @@ def score(rows: Sequence[dict[str, float]], limit: float) -> float | None:
 
 def versions() -> dict[str, str]:
     """What the figures of a run depend on beside its settings."""
-    return {name: version(name) for name in ("torch", "torchrl", "pybullet")}
+    found = {}
+    for name in ("torch", "torchrl", "pybullet", "mujoco"):
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

@@ -36,6 +36,7 @@ from torchrl_safe.envs import (
     PAPER_JOINT,
     ActionMode,
     ArmEnv,
+    Bullet,
     CartesianDelta,
     Collision,
     FullObservation,
@@ -43,8 +44,10 @@ from torchrl_safe.envs import (
     InFront,
     JointDelta,
     Moving,
+    MuJoCo,
     NoObstacles,
     Obstacles,
+    Physics,
     Scattered,
     gym,
     paper_env,
@@ -62,6 +65,7 @@ OBSTACLES: dict[str, Obstacles] = {
     "human": Human(),
 }
 ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointDelta()}
+PHYSICS: dict[str, Physics] = {"bullet": Bullet(), "mujoco": MuJoCo()}
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
 COSTS = {"collision": Collision()}
@@ -99,6 +103,7 @@ def make_env(
             action=ACTIONS[config.action],
             obstacles=OBSTACLES[config.obstacles],
             costs=COSTS,
+            physics=PHYSICS[config.physics],
             **settings,
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])

@@ -8,6 +8,7 @@ import numpy as np
 import pybullet
 import pytest
 import torch
+from bullet_worlds import worlds_of
 from scripted import fly, over, straight
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
@@ -17,6 +18,7 @@ from worlds import each_arm
 
 from torchrl_safe.envs import (
     ArmEnv,
+    Bullet,
     Camera,
     CartesianDelta,
     Collision,
@@ -29,7 +31,6 @@ from torchrl_safe.envs import (
     Push,
     Reach,
     Region,
-    Scene,
 )
 
 ACTIONS = [CartesianDelta(), JointDelta()]
@@ -317,7 +318,7 @@ def test_terminal_observation_is_true(make_env):
 
 def test_touch_in_the_middle_of_a_control_step_counts(make_env):
     """Each substep is read: a touch that is over at the end of the control step still costs."""
-    settings = {"scene": Scene(motor_gain=0.1), "seed": 0}
+    settings = {"physics": Bullet(motor_gain=0.1), "seed": 0}
     coarse = make_env(ArmEnv, **settings)
     # Of the same control rate, as far as the speed of the joints goes.
     fine = make_env(ArmEnv, frame_skip=1, **settings)
@@ -331,13 +332,13 @@ def test_touch_in_the_middle_of_a_control_step_counts(make_env):
         action = towards(coarse, aim)
         cost = step(coarse, action)["cost"].item()
         # The same motion by hand, one substep at a time.
-        joints, fingers = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._worlds)
+        joints, fingers = fine.action_mode.targets(action.numpy(), fine.arm_state, fine._simulator)
         joints, fingers = fine._within_speed(joints, fingers)
         touches = []
         for _ in range(12):
-            fine._batch.advance(joints, fingers)
-            touches.append(fine._batch.state(fine._elapsed).contact_distance.item() <= 0)
-        fine._state = fine._batch.state(fine._elapsed)
+            fine._simulator.advance(joints, fingers)
+            touches.append(fine._simulator.state().contact_distance.item() <= 0)
+        fine._state = fine._simulator.state()
         assert cost == float(any(touches)), index
         lost += any(touches) and not touches[-1]
     assert lost > 0
@@ -348,7 +349,7 @@ def test_states_and_resets_do_not_remember_touches(make_env):
     env.reset()
     start = env.arm_state
     while not step(env, towards(env, env.arm_state.obstacle_position[:, 0]))["cost"]:
-        assert env._elapsed < 40
+        assert env.arm_state.step < 40
     # A state is a record: what comes after it does not change it.
     assert start.contact_distance == np.inf
     env.reset()
@@ -452,6 +453,7 @@ def test_bad_arguments(arguments, message):
         ({"task": Reach}, "task must be an instance of Task, got <class"),
         ({"obstacles": Cylinder()}, "obstacles must be an instance of Obstacles"),
         ({"scene": None}, "scene must be an instance of Scene, got None"),
+        ({"physics": Bullet}, "physics must be an instance of Physics, got <class"),
         ({"observation": FullObservation}, "observation must be a callable object, got <class"),
         ({"observation": lambda s: s.goal}, "what observation returns must be an instance of Map"),
         ({"costs": [Collision()]}, "costs must be an instance of Mapping"),
@@ -490,13 +492,13 @@ def test_closed_environment_says_so(make_env):
     closed.close()
     other = make_env(ArmEnv, seed=0)
     other.reset()
-    before = other._worlds[0].read()
+    before = worlds_of(other)[0].read()
     for use in (lambda: step(closed, torch.ones(1, 3)), closed.reset, closed.render):
         with pytest.raises(RuntimeError, match="This ArmEnv is closed"):
             use()
     with pytest.raises(pybullet.error, match="Not connected"):
-        closed._worlds[0].advance([0.0] * 7, [], 12)
-    assert other._worlds[0].read() == before
+        worlds_of(closed)[0].advance([0.0] * 7, [], 12)
+    assert worlds_of(other)[0].read() == before
 
 
 @pytest.mark.parametrize("copier", [copy.deepcopy, pickle.dumps], ids=["deepcopy", "pickle"])

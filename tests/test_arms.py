@@ -7,6 +7,7 @@ import numpy as np
 import pybullet
 import pytest
 import torch
+from bullet_worlds import make_world, worlds_of
 from tensordict import TensorDict
 from worlds import ARMS, each_arm
 
@@ -21,8 +22,7 @@ from torchrl_safe.envs import (
     Reach,
     Scene,
 )
-from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
+from torchrl_safe.envs.arms.urdf import find_urdf, prepare_urdf
 
 
 class Pose:
@@ -170,7 +170,7 @@ def test_obstacles_leave_the_arm_free_at_home(make_env, arm):
         env.reset()
         way = env.arm_state.goal - env.arm_state.ee_position
         assert np.linalg.norm(way[:, :2]) >= 0.23
-        assert env._worlds[0].clearance() > 0.02
+        assert env._simulator.clearance(0) > 0.02
 
 
 @each_arm
@@ -205,7 +205,7 @@ def test_fingers_open_and_close(make_env, arm):
         action=CartesianDelta(finger_step=0.04),
     )
     env.reset()
-    world = env._worlds[0]
+    world = worlds_of(env)[0]
     assert env.arm_state.finger_position.shape == (1, 2)
     home = env.arm_state.ee_position
     for share in (1.0, 0.0):
@@ -268,7 +268,7 @@ def test_arm_rejects(changes, error, message):
 
 def test_tool_must_be_moved_by_a_joint():
     with pytest.raises(ValueError, match="ee_link must be a link that a joint moves, got 'panda_l"):
-        World(dataclasses.replace(PANDA, ee_link="panda_link0", home=()), Scene(), ())
+        make_world(dataclasses.replace(PANDA, ee_link="panda_link0", home=()))
 
 
 def test_urdf_of_the_working_directory(tmp_path, monkeypatch):

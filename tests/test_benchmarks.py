@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from bullet_worlds import worlds_of
 
 from benchmarks.floor import Tape
 from benchmarks.handwritten import HandWritten, arguments
@@ -55,7 +56,7 @@ def test_parts_are_kept_and_replaced(tmp_path):
 
 def test_floor_moves_the_worlds_as_the_environment_did():
     env = ArmEnv(num_envs=2, frame_skip=3)
-    tape = Tape(2)
+    tape = Tape()
 
     def play():
         env.set_seed(0)
@@ -64,10 +65,10 @@ def test_floor_moves_the_worlds_as_the_environment_did():
     torch.manual_seed(0)
     with tape.recording():
         env.rollout(5, auto_reset=False, tensordict=play(), break_when_any_done=False)
-    moved = env._batch.state(env._elapsed).joint_position
+    moved = env._simulator.state().joint_position
     play()
     tape.play()
-    np.testing.assert_array_equal([world.read()[:7] for world in env._worlds], moved)
+    np.testing.assert_array_equal([world.read()[:7] for world in worlds_of(env)], moved)
     env.close()
 
 

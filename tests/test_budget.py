@@ -24,7 +24,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_safe.envs import ArmEnv, CostToReward, EarlyTermination, Saute, Speed
-from torchrl_safe.envs.budget import CostTally
+from torchrl_safe.envs.transforms.budget import CostTally
 
 # In step t of a CountingBatch: reward 10 t, cost t / 4; row r is truncated after r + 2 steps.
 WRAPPED = {

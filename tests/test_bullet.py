@@ -9,6 +9,7 @@ import numpy as np
 import pybullet
 import pytest
 import torch
+from bullet_worlds import make_world, worlds_of
 from tensordict import TensorDict
 
 from torchrl_safe.envs import (
@@ -22,8 +23,7 @@ from torchrl_safe.envs import (
     Placement,
     Region,
 )
-from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.scene import Scene
+from torchrl_safe.envs.physics.scene import Scene
 
 
 def open_clients():
@@ -44,7 +44,7 @@ def test_closing_one_environment_leaves_the_other(make_env):
     # The numbers of the closed servers go to the next environment, and nothing that belonged
     # to the first may close them, neither a second close nor its garbage collection.
     three = make_env(ArmEnv, num_envs=2, seed=0)
-    for world in one._worlds:
+    for world in worlds_of(one):
         world.close()
     del one
     gc.collect()
@@ -68,7 +68,7 @@ def test_two_environments_do_not_disturb_each_other(make_env):
 def test_open_and_close_leaves_nothing():
     before = open_clients()
     for _ in range(100):
-        world = World(PANDA, Scene(), ())
+        world = make_world()
         world.close()
         world.close()
     assert open_clients() == before
@@ -87,7 +87,7 @@ def test_closing_closes_the_world_of_the_pictures():
 
 def test_forgotten_world_is_closed():
     before = open_clients()
-    world = World(PANDA, Scene(), ())
+    world = make_world()
     assert open_clients() != before
     del world
     assert open_clients() == before
@@ -123,7 +123,7 @@ def test_failed_environment_is_closed():
 def test_bad_arm_raises_and_leaves_no_server(arm, message):
     before = open_clients()
     with pytest.raises(ValueError, match=message):
-        World(arm, Scene(), ())
+        make_world(arm)
     assert open_clients() == before
 
 
@@ -179,7 +179,7 @@ def test_jacobian_is_that_of_the_origin_of_the_link(lever):
     turn, swing = 1.2, -0.1
     x, y = 0.5 * math.cos(turn), 0.5 * math.sin(turn)
     expected = [[-y, 0], [x, 0], [0, 0], [0, -math.sin(turn)], [0, math.cos(turn)], [1, 0]]
-    world = World(lever, Scene(), ())
+    world = make_world(lever)
     try:
         np.testing.assert_allclose(world.jacobian([turn, swing]), expected, atol=1e-5)
     finally:
@@ -187,7 +187,7 @@ def test_jacobian_is_that_of_the_origin_of_the_link(lever):
 
 
 def test_joints_without_limits(lever):
-    world = World(lever, Scene(), ())
+    world = make_world(lever)
     try:
         assert (world.joint_lower == -np.inf).all()
         assert (world.joint_upper == np.inf).all()
@@ -198,7 +198,7 @@ def test_joints_without_limits(lever):
 
 @pytest.mark.parametrize("from_urdf", [True, False])
 def test_inertia_is_that_of_the_urdf_if_wanted(lever, from_urdf):
-    world = World(lever, Scene(urdf_inertia=from_urdf), ())
+    world = make_world(lever, urdf_inertia=from_urdf)
     try:
         inertia = pybullet.getDynamicsInfo(world._arm.body, 1, physicsClientId=world._client)[2]
         assert (inertia == (1, 2, 3)) == from_urdf
@@ -223,7 +223,7 @@ def test_free_obstacle_falls_onto_the_table(make_env):
 
 
 def test_picture_world_takes_joints_and_poses():
-    one, two = (World(PANDA, Scene(), (Cylinder(mass=1.0),)) for _ in range(2))
+    one, two = (make_world(shapes=(Cylinder(mass=1.0),)) for _ in range(2))
     try:
         lying = ((0.6, 0.1, 0.05), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
         one.reset(Placement([[0.5, 0, 0.1]]), np.zeros(3), np.zeros((0, 3)))

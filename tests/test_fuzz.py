@@ -36,7 +36,7 @@ PARTS = st.sampled_from(
     [envs.Box(), envs.Cylinder(mass=0.1), envs.Sphere(0.03), envs.Capsule(), envs.Swing(),
      envs.Patrol(), envs.InFront(), envs.Scattered(1), envs.NoObstacles(), envs.Human(),
      envs.Region((0.3, -0.4, 0.0), (0.7, 0.4, 0.2)), envs.Reach(), envs.Push(), envs.Collision(),
-     envs.JointDelta(), envs.Scene(), envs.Camera(), envs.PANDA, envs.Sensing()]
+     envs.JointDelta(), envs.Scene(), envs.Bullet(), envs.Camera(), envs.PANDA, envs.Sensing()]
 )  # fmt: skip
 ANYTHING = st.one_of(NUMBERS, NUMBERS, POINTS, ROWS, ODD, PARTS)
 
@@ -118,9 +118,9 @@ COSTS = (
     envs.SpeedAndSeparation, envs.Workspace,
 )  # fmt: skip
 OTHERS = (
-    envs.Scene, envs.Camera, envs.Region, envs.Box, envs.Cylinder, envs.Sphere, envs.Capsule,
-    envs.Swing, envs.Patrol, envs.Sensing, envs.Placement, envs.Gripper, envs.ArmModel,
-    envs.DampedLeastSquares,
+    envs.Scene, envs.Bullet, envs.Camera, envs.Region, envs.Box, envs.Cylinder, envs.Sphere,
+    envs.Capsule, envs.Swing, envs.Patrol, envs.Sensing, envs.Placement, envs.Gripper,
+    envs.ArmModel, envs.DampedLeastSquares,
 )  # fmt: skip
 
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from worlds import each_arm
 
-from torchrl_safe.envs import PANDA, UR5, XARM6, ArmEnv, NoObstacles, Scene, World, find_home
+from torchrl_safe.envs import PANDA, UR5, XARM6, ArmEnv, Bullet, NoObstacles, Scene, find_home
 
 DOWN = (1.0, 0.0, 0.0, 0.0)
 
 
 def pose_of(arm, angles):
-    world = World(arm, Scene(), ())
-    position, orientation = world.tool_at(list(angles))
-    limits = world.joint_lower, world.joint_upper
-    world.close()
-    return np.array(position), np.array(orientation), limits
+    simulator = Bullet().build(arm, Scene(), num_envs=1)
+    positions, orientations = simulator.tool_at(np.array([angles]))
+    limits = simulator.joint_lower, simulator.joint_upper
+    simulator.close()
+    return positions[0], orientations[0], limits
 
 
 @each_arm
@@ -107,3 +107,8 @@ def test_an_arm_with_too_few_joints(turntable):
 def test_bad_arguments(arguments, kind, message):
     with pytest.raises(kind, match=message):
         find_home(*arguments)
+
+
+def test_physics_is_an_engine():
+    with pytest.raises(TypeError, match="physics must be an instance of Physics, got 'bullet'"):
+        find_home(PANDA, (0.4, 0, 0.2), physics="bullet")

@@ -116,7 +116,7 @@ def test_arms_at_home_are_out_of_reach_at_first(make_env, arm):
     )
     for _ in range(5):
         env.reset()
-        assert all(world.clearance() > 0.02 for world in env._worlds)
+        assert all(env._simulator.clearance(row) > 0.02 for row in range(env.num_envs))
         assert not rest(env)["cost"].any()
 
 

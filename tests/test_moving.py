@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from bullet_worlds import worlds_of
 from tensordict import TensorDict
 from worlds import Places, rest, step, turn
 
@@ -168,7 +169,7 @@ def test_the_simulator_follows_the_path(make_env):
     )
     env = make_env(ArmEnv, num_envs=2, obstacles=layout, seed=0, max_episode_steps=1000)
     env.reset()
-    world = env._worlds[1]
+    world = worlds_of(env)[1]
     path = world._placement.at
     for index in range(30):
         state = env.arm_state
@@ -225,9 +226,9 @@ def test_motion_begins_anew_with_the_episode(make_env):
         assert torch.equal(expected["observation"][1], got["observation"][1])
         if index in (3, 6):
             other.reset(TensorDict({**got, "_reset": mask}, batch_size=[2]))
-            begin = other._worlds[0]._placement.at(np.zeros(1))[0][0]
+            begin = worlds_of(other)[0]._placement.at(np.zeros(1))[0][0]
             np.testing.assert_array_equal(other.arm_state.obstacle_position[0], begin)
-    paths = [env._worlds[0]._placement for env in (alone, other)]
+    paths = [worlds_of(env)[0]._placement for env in (alone, other)]
     assert not np.allclose(paths[0].position, paths[1].position)
 
 
@@ -263,7 +264,7 @@ def test_it_does_not_stop_for_the_arm(make_env):
 
 
 def rest_position(env):
-    world = env._worlds[0]
+    world = worlds_of(env)[0]
     return world._placement.at(np.array([world._substeps / RATE]))[0]
 
 

@@ -149,7 +149,7 @@ def test_scattered_leaves_arm_and_object_free(make_env, task):
     env = make_env(ArmEnv, num_envs=2, **task, obstacles=layout, costs=costs, seed=0)
     for _ in range(100):
         env.reset()
-        assert all(world.clearance() > 0 for world in env._worlds)
+        assert all(env._simulator.clearance(row) > 0 for row in range(2))
         state = env.arm_state
         if task:
             apart = state.obstacle_position - state.object_position

@@ -10,6 +10,7 @@ import numpy as np
 import pybullet
 import pytest
 import torch
+from bullet_worlds import worlds_of
 from scripted import fly, go, straight
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
@@ -108,7 +109,7 @@ def test_tool_pose_lags_one_substep(make_env):
     env = make_env(paper_env, seed=0)
     env.reset()
     step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0]]))
-    fresh = np.array(env._worlds[0].read(fresh=True))[18:21]
+    fresh = np.array(worlds_of(env)[0].read(fresh=True))[18:21]
     step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0]]))
     np.testing.assert_allclose(env.arm_state.ee_position[0], fresh, atol=1e-6)
 
@@ -132,7 +133,7 @@ def test_arguments_go_before_the_papers(make_env):
 
 
 def test_obstacle_weighs_a_kilogram(make_env):
-    world = make_env(paper_env)._worlds[0]
+    world = worlds_of(make_env(paper_env))[0]
     body = pybullet.getDynamicsInfo(world._obstacles[0], -1, physicsClientId=world._client)
     assert body[0] == 1
 

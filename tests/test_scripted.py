@@ -6,6 +6,7 @@ The thresholds are those of 32 episodes, measured; here are 8 of them, which alw
 import numpy as np
 import pybullet
 import pytest
+from bullet_worlds import worlds_of
 from scripted import (
     HOLD,
     carry,
@@ -113,7 +114,7 @@ def test_fingers_hold_by_friction(make_env, arm):
 
 
 def _finger_forces(env, row):
-    world = env._worlds[row]
+    world = worlds_of(env)[row]
     points = pybullet.getContactPoints(
         world._arm.body, world._objects[0], physicsClientId=world._client
     )

@@ -7,6 +7,7 @@ from worlds import ARMS, Places, each_arm, home_of, rest, step
 from torchrl_safe.envs import (
     ArmEnv,
     Box,
+    Bullet,
     CartesianDelta,
     Collision,
     ContactForce,
@@ -241,7 +242,7 @@ def test_approach_of_every_arm(make_env, arm):
 
 def test_speeds_of_the_turntable(make_env, turntable):
     """The tool point at 0.5 m from the axis; the bar's own centre does not move."""
-    turntable["scene"] = Scene(merged_links=False)
+    turntable["physics"] = Bullet(merged_links=False)
     env = make_env(ArmEnv, **turntable, costs={"speed": Speed(limit=0.6, any_link=True)})
     env.reset()
     for action in (1.0, 0.5):
@@ -281,7 +282,7 @@ def test_speeds_of_every_arm(make_env, arm):
 def test_a_middle_substep_counts(make_env, turntable):
     """A cost that is over at the end of the control step, as one that takes the substeps finds."""
     costs = {"table": Speed(limit=0.9)}
-    turntable["scene"] = Scene(motor_gain=0.3)
+    turntable["physics"] = Bullet(motor_gain=0.3)
     env = make_env(ArmEnv, **turntable, costs=costs)
     env.reset()
     cost = step(env, 1.0)["cost"].item()

@@ -1,10 +1,10 @@
 import numpy as np
 import pybullet
 import pytest
+from bullet_worlds import make_world
 from worlds import Places, rest, step, turn
 
 from torchrl_safe.envs import (
-    PANDA,
     ArmEnv,
     Box,
     Capsule,
@@ -15,9 +15,8 @@ from torchrl_safe.envs import (
     Region,
     Sphere,
 )
-from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.scene import Scene
-from torchrl_safe.envs.shapes import footprint
+from torchrl_safe.envs.obstacles.shapes import footprint
+from torchrl_safe.envs.physics.scene import Scene
 
 SHAPES = {
     "cylinder": Cylinder(radius=0.03, height=0.16, mass=0.3),
@@ -96,7 +95,7 @@ def test_it_can_be_knocked_over(make_env, shape):
 def test_angular_velocity_is_a_derivative(shape):
     """In free flight: the change of the axes is the cross product with the angular velocity."""
 
-    world = World(PANDA, Scene(gravity=0.0), (shape,))
+    world = make_world(scene=Scene(gravity=0.0), shapes=(shape,))
     try:
         world.reset(Placement([[0.6, 0.3, 0.5]]), np.zeros(3), np.zeros((0, 3)))
 

@@ -19,8 +19,8 @@ from torchrl_safe.envs import (
     Reach,
     Region,
 )
+from torchrl_safe.envs.generators import pack
 from torchrl_safe.envs.gym import ARMS, OBSTACLES, TASKS, combination
-from torchrl_safe.envs.record import pack
 
 # Now and then a goal is drawn that leaves no room between it and the arm at home.
 TIGHT = InFront(gap=0.195)
@@ -48,7 +48,7 @@ def test_a_rare_draw_does_not_end_a_run(make_env):
     for _ in range(400):
         first.append(Reach().sample(copy_of(env._generators[0]), env.arm.goals)[0])
         env.reset()
-        assert env._worlds[0].clearance() > 0
+        assert env._simulator.clearance(0) > 0
         goals.append(env.arm_state.goal[0])
     again = (np.array(goals) != first).any(axis=1)
     assert 1 <= again.sum() <= 20
@@ -104,7 +104,7 @@ def test_a_first_draw_that_fits_is_taken(make_env, task, obstacles):
         state = env.arm_state
         for row, rng in enumerate(copies):
             goal, objects = task.sample(rng, env.arm.goals)
-            start = objects[0] if len(objects) else np.array(env._worlds[row].home_position)
+            start = objects[0] if len(objects) else env._simulator.home_position
             placement = layout.sample(rng, start, goal)
             if (pack(rng) != pack(env._generators[row])).any():
                 continue  # This one was drawn again.

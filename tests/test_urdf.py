@@ -5,11 +5,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pybullet_data
 import pytest
+from bullet_worlds import make_world
 
-from torchrl_safe.envs import PANDA, ArmModel, Gripper, Placement, Scene
-from torchrl_safe.envs.bullet import World
+from torchrl_safe.envs import PANDA, ArmModel, Gripper, Placement
+from torchrl_safe.envs.arms.urdf import find_urdf, prepare_urdf
 from torchrl_safe.envs.gym import ARMS
-from torchrl_safe.envs.urdf import find_urdf, prepare_urdf
 
 
 def arm(path, ee_link, gripper=None):
@@ -241,8 +241,10 @@ def numbers(text):
 @pytest.mark.parametrize(("urdf_inertia", "tolerance"), [(True, 2e-4), (False, 0.06)])
 def test_merged_arms_move_as_they_did(name, urdf_inertia, tolerance):
     """Every arm, flung about for half a second; Bullet's own inertias are those of other boxes."""
-    scenes = (Scene(merged_links=merged, urdf_inertia=urdf_inertia) for merged in (False, True))
-    worlds = [World(ARMS[name], scene, ()) for scene in scenes]
+    worlds = [
+        make_world(ARMS[name], merged_links=merged, urdf_inertia=urdf_inertia)
+        for merged in (False, True)
+    ]
     generator = np.random.default_rng(0)
     try:
         for world in worlds:

@@ -1,9 +1,38 @@
-"""A check that environments and losses share."""
+"""Checks of what comes in, for environments and losses; errors name the argument and the value."""
 
 from __future__ import annotations
 
+import math
 import operator
-from typing import Any
+from numbers import Real
+from types import UnionType
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LARGEST = np.finfo(np.float32).max
+
+
+def check_positive(**values: float) -> None:
+    """Raises ValueError unless each value is a number, positive and finite."""
+    for name, value in values.items():
+        if not _is_finite(value) or value <= 0:
+            raise ValueError(f"{name} must be positive and finite, got {value!r}.")
+
+
+def check_not_negative(**values: float) -> None:
+    """Raises ValueError unless each value is a number, not negative and finite."""
+    for name, value in values.items():
+        if not _is_finite(value) or value < 0:
+            raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
+
+
+def check_flag(**values: bool) -> None:
+    """Raises TypeError unless each value is True or False."""
+    for name, value in values.items():
+        if not isinstance(value, bool | np.bool_):
+            raise TypeError(f"{name} must be True or False, got {value!r}.")
 
 
 def check_count(*, least: int = 1, **values: Any) -> None:
@@ -15,3 +44,37 @@ def check_count(*, least: int = 1, **values: Any) -> None:
             usable = False
         if not usable:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
+
+
+def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
+    """Raises TypeError unless the value is an object of a class or protocol, not a class."""
+    if isinstance(value, type) or not isinstance(value, kind):
+        kinds = get_args(kind) or (kind,)
+        names = " or ".join(each.__name__ for each in kinds)
+        raise TypeError(f"{name} must be an instance of {names}, got {value!r}.")
+
+
+def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Returns the values as an array; raises ValueError unless they have a shape and are finite.
+
+    Finite in single precision, which is what tensors of them will have.
+    """
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "biuf":  # Not of text or objects, which NumPy converts too.
+            raise TypeError(f"no numbers: {array.dtype}")
+        array = array.astype(float)
+    except (OverflowError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} must be numbers of shape {shape}, got {values!r}.") from error
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}.")
+    if not (np.abs(array) <= _LARGEST).all():
+        raise ValueError(f"{name} must be finite, got {array}.")
+    return array
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return isinstance(value, Real) and math.isfinite(value)
+    except OverflowError:  # Python's whole numbers go on where floats end.
+        return False

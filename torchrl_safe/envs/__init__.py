@@ -1,6 +1,7 @@
 """Robot arms with costs as TorchRL environments, and transforms for any environment with costs.
 
-Only the arms need the ``arms`` extra (PyBullet).
+Only arms need a physics engine: ``physics=Bullet()`` the ``arms`` extra, ``physics=MuJoCo()`` the
+``mujoco`` extra.
 """
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
@@ -16,7 +17,6 @@ from torchrl_safe.envs.arms import (
     ArmModel,
     Gripper,
 )
-from torchrl_safe.envs.bullet import World
 from torchrl_safe.envs.costs import (
     Collision,
     ContactForce,
@@ -26,26 +26,35 @@ from torchrl_safe.envs.costs import (
     SpeedAndSeparation,
     Workspace,
 )
-from torchrl_safe.envs.early_termination import EarlyTermination
-from torchrl_safe.envs.frame_skip import FrameSkip
 from torchrl_safe.envs.home import find_home
-from torchrl_safe.envs.human import Human
-from torchrl_safe.envs.kinematics import (
-    BulletInverseKinematics,
-    DampedLeastSquares,
-    InverseKinematics,
-)
-from torchrl_safe.envs.moving import Motion, Moving, Patrol, Swing
+from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.observations import FullObservation, paper_observation
-from torchrl_safe.envs.obstacles import InFront, NoObstacles, Obstacles, Placement, Scattered
+from torchrl_safe.envs.obstacles import (
+    Box,
+    Capsule,
+    Cylinder,
+    Human,
+    InFront,
+    Motion,
+    Moving,
+    NoObstacles,
+    Obstacles,
+    Patrol,
+    Placement,
+    Scattered,
+    Shape,
+    Sphere,
+    Swing,
+)
 from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS, paper_env
+from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
+from torchrl_safe.envs.physics.mujoco import MuJoCo
+from torchrl_safe.envs.physics.scene import Camera, Scene
+from torchrl_safe.envs.physics.simulator import Physics, Simulator
 from torchrl_safe.envs.regions import NoRoomError, Region
-from torchrl_safe.envs.saute import Saute
-from torchrl_safe.envs.scene import Camera, Scene
-from torchrl_safe.envs.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
-from torchrl_safe.envs.transforms import CostToReward
+from torchrl_safe.envs.transforms import CostToReward, EarlyTermination, FrameSkip, Saute
 
 __all__ = [
     "IIWA",
@@ -63,6 +72,7 @@ __all__ = [
     "ArmModel",
     "ArmState",
     "Box",
+    "Bullet",
     "BulletInverseKinematics",
     "Camera",
     "Capsule",
@@ -83,10 +93,12 @@ __all__ = [
     "JointLimit",
     "Motion",
     "Moving",
+    "MuJoCo",
     "NoObstacles",
     "NoRoomError",
     "Obstacles",
     "Patrol",
+    "Physics",
     "PickAndPlace",
     "Placement",
     "Proximity",
@@ -99,13 +111,13 @@ __all__ = [
     "Sensing",
     "Sensor",
     "Shape",
+    "Simulator",
     "Speed",
     "SpeedAndSeparation",
     "Sphere",
     "Swing",
     "Task",
     "Workspace",
-    "World",
     "find_home",
     "paper_env",
     "paper_observation",

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.checks import check_array, check_flag, check_positive
+from torchrl_safe._checks import check_array, check_flag, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
+from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
 from torchrl_safe.envs.state import ArmState, Array
 
 
 @runtime_checkable
 class ActionMode(Protocol):
-    """What :class:`~torchrl_safe.envs.ArmEnv` asks of an action representation."""
+    """What :class:`~torchrl_safe.envs.ArmEnv` asks of an action representation.
+
+    The motors' targets move evenly over the substeps of the control step, from where the joints
+    are to what :meth:`targets` returns. The joints are there at its end, where their efforts and
+    speeds allow, with every physics engine.
+    """
 
     @property
     def bound(self) -> float:
@@ -31,10 +35,15 @@ class ActionMode(Protocol):
     def width(self, num_joints: int) -> int:
         """Returns the number of components of an action."""
 
-    def targets(
-        self, action: Array, state: ArmState, worlds: Sequence[World]
-    ) -> tuple[Array, Array]:
-        """Returns joint targets, rad, ``(N, n)``, and finger targets, m, ``(N, f or 0)``."""
+    def targets(self, action: Array, state: ArmState, simulator: Simulator) -> tuple[Array, Array]:
+        """Returns joint targets, rad, ``(N, n)``, and finger targets, m, ``(N, f or 0)``.
+
+        Args:
+            action: the action, ``(N, width)``, within the bound.
+            state: the current state.
+            simulator: gives Jacobians and the home pose, see
+                :class:`~torchrl_safe.envs.Simulator`.
+        """
 
 
 @dataclass(frozen=True)
@@ -46,8 +55,8 @@ class CartesianDelta:
     that turn it, and last the one that moves the fingers.
 
     Args:
-        step: displacement that an action of 1 asks for, m. The motors do a part of it until the
-            next action: the scene's ``motor_gain``, and the speed limits of the joints.
+        step: displacement that an action of 1 asks for, m. The tool does it until the next
+            action, as far as the joints' efforts, speeds and limits allow.
         bound: largest magnitude of a component; infinity leaves actions unclipped.
         inverse_kinematics: turns tool poses into joint angles.
         orientation: tool orientation to keep, a quaternion (x, y, z, w). ``None`` keeps that of
@@ -108,14 +117,12 @@ class CartesianDelta:
         turns = 3 if self.rotation_step is not None else int(self.yaw_step is not None)
         return 3 + turns + self.moves_fingers
 
-    def targets(
-        self, action: Array, state: ArmState, worlds: Sequence[World]
-    ) -> tuple[Array, Array]:
+    def targets(self, action: Array, state: ArmState, simulator: Simulator) -> tuple[Array, Array]:
         position = state.ee_position + self.step * action[:, :3]
-        home = worlds[0].home_orientation
+        home = simulator.home_orientation
         kept = np.asarray(home if self.orientation is None else self.orientation)
         joints = self.inverse_kinematics(
-            position, self._orientation(action, state, kept), state, worlds
+            position, self._orientation(action, state, kept), state, simulator
         )
         return joints, _finger_targets(action, state, self.finger_step)
 
@@ -142,8 +149,8 @@ class JointDelta:
     """Turns each joint by ``step`` radians times the action (the paper's AR2).
 
     Args:
-        step: rotation that an action of 1 asks for, rad. How much of it the motors do until the
-            next action is the scene's ``motor_gain``: by default 65 %.
+        step: rotation that an action of 1 asks for, rad. The joints do it until the next action,
+            as far as their efforts and speeds allow.
         bound: largest magnitude of a component; infinity leaves actions unclipped.
         respect_limits: never ask for an angle beyond the joint limits.
         finger_step: if given, a last component sets the free fingers' position, in metres per
@@ -176,9 +183,7 @@ class JointDelta:
     def width(self, num_joints: int) -> int:
         return num_joints + self.moves_fingers
 
-    def targets(
-        self, action: Array, state: ArmState, worlds: Sequence[World]
-    ) -> tuple[Array, Array]:
+    def targets(self, action: Array, state: ArmState, simulator: Simulator) -> tuple[Array, Array]:
         joints = state.joint_position
         joints = joints + self.step * action[:, : joints.shape[1]]
         if self.respect_limits:

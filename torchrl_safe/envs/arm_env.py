@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial, reduce
@@ -18,29 +17,31 @@ from torchrl._utils import seed_generator
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_safe._checks import check_count
+from torchrl_safe._checks import check_array, check_count, check_kind
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta
 from torchrl_safe.envs.arms import PANDA, ArmModel
-from torchrl_safe.envs.batch import WorldBatch
-from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.costs import Collision
+from torchrl_safe.envs.generators import PACKED_SIZE, pack, unpack
 from torchrl_safe.envs.observations import FullObservation
 from torchrl_safe.envs.obstacles import InFront, Obstacles
-from torchrl_safe.envs.record import EpisodeRecord, pack, unpack
-from torchrl_safe.envs.scene import SUBSTEP, Camera, Scene
+from torchrl_safe.envs.physics.bullet import Bullet
+from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
+from torchrl_safe.envs.physics.simulator import Physics
 from torchrl_safe.envs.starts import Starts
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Sensor
 from torchrl_safe.envs.tasks import Reach, Task
 
 Cost = Callable[[ArmState], Array]
 
+# What the names of the simulator's own arrays begin with in a saved state.
+_PHYSICS = "physics."
+
 
 class ArmEnv(EnvBase):
     """A robot arm that has a task to do and costs to keep low.
 
-    Natively batched: every row is a PyBullet world of its own, all in this process. What can
-    be chosen is passed as an object: any arm with any action, task, obstacles and costs.
+    Natively batched: every row is a world of its own, all in this process. What can be chosen is
+    passed as an object: any arm with any action, task, obstacles, costs and physics.
 
     The keys, for N worlds and k costs: ``observation`` (N, width), ``action`` (N, width), and
     under ``"next"`` also ``reward`` (N, 1), ``cost`` (N, k), ``success`` (N, 1), ``terminated``
@@ -71,13 +72,14 @@ class ArmEnv(EnvBase):
             ``12``: a control rate of 20 Hz.
         max_episode_steps (int, optional): time limit; sets ``truncated``. Defaults to ``40``,
             2 s at 20 Hz.
-        scene (Scene, optional): how the world is simulated. Defaults to ``Scene()``.
+        scene (Scene, optional): gravity, fingers and motors. Defaults to ``Scene()``.
+        physics (Physics, optional): the engine that simulates it. Defaults to ``Bullet()``.
         seed (int, optional): seed of the goals and obstacles. Every row has a generator of its
             own; the seeds follow TorchRL's chain: after ``set_seed`` of a ``ParallelEnv`` or a
             collector, two environments of one world draw what one of two worlds draws. A seed
             that a factory gives to several workers is the same in each: leave it out there.
         device (torch.device, optional): device of the tensors. Defaults to ``None``.
-        gui (bool, optional): show the first world in PyBullet's window. Defaults to ``False``.
+        gui (bool, optional): show the first world in a window. Defaults to ``False``.
 
     Raises:
         TypeError: if an argument is not of its kind.
@@ -113,6 +115,7 @@ class ArmEnv(EnvBase):
         frame_skip: int = 12,
         max_episode_steps: int = 40,
         scene: Scene = Scene(),
+        physics: Physics = Bullet(),
         seed: int | None = None,
         device: torch.device | str | None = None,
         gui: bool = False,
@@ -123,6 +126,7 @@ class ArmEnv(EnvBase):
         check_kind("task", task, Task)
         check_kind("obstacles", obstacles, Obstacles)
         check_kind("scene", scene, Scene)
+        check_kind("physics", physics, Physics)
         costs = {"collision": Collision()} if costs is None else costs
         check_kind("costs", costs, Mapping)
         if not costs:
@@ -140,35 +144,31 @@ class ArmEnv(EnvBase):
         self.frame_skip = frame_skip
         self.max_episode_steps = max_episode_steps
         self.observation = observation
-        # What touches objects has friction and stiffness of its own, link by link.
-        self.scene = replace(
-            scene,
-            free_fingers=scene.free_fingers or action.moves_fingers,
-            merged_links=scene.merged_links and not task.objects,
-        )
-        self._elapsed = np.zeros(num_envs, dtype=int)
+        self.physics = physics
+        self.scene = replace(scene, free_fingers=scene.free_fingers or action.moves_fingers)
         self._begun = False
-        self._record = EpisodeRecord(num_envs)
+        # States of the generators before the running episodes were drawn.
+        self._draws = np.zeros((num_envs, PACKED_SIZE), dtype=np.uint8)
         self.set_seed(seed)
         sensors = {name: cost.sensing for name, cost in costs.items() if isinstance(cost, Sensor)}
         for name, sensing in sensors.items():
             check_kind(f"sensing of cost {name!r}", sensing, Sensing)
-        self._batch = WorldBatch(
-            num_envs,
+        self._simulator = physics.build(
             arm,
             self.scene,
-            obstacles.shapes,
-            task.objects,
+            num_envs=num_envs,
+            shapes=obstacles.shapes,
+            objects=task.objects,
             sensing=reduce(or_, sensors.values(), Sensing()),
             frame_skip=frame_skip,
             gui=gui,
         )
-        self._starts = Starts(arm, task, obstacles, self._batch)
+        self._starts = Starts(arm, task, obstacles, self._simulator)
         try:
             self._starts.check()
             self._make_specs()
         except BaseException:
-            self._batch.close()
+            self._simulator.close()
             raise
         self.is_closed = False
 
@@ -182,10 +182,6 @@ class ArmEnv(EnvBase):
             "costs": self.costs,
         }
         return "\n".join(f"{name}={part}" for name, part in parts.items())
-
-    @property
-    def _worlds(self) -> list[World]:
-        return self._batch.worlds
 
     @property
     def num_envs(self) -> int:
@@ -210,13 +206,13 @@ class ArmEnv(EnvBase):
     def _make_specs(self) -> None:
         for row in range(self.num_envs):
             self._reset_world(row, np.random.default_rng(0))
-        self._state = state = self._batch.state(self._elapsed)
+        self._state = state = self._simulator.state()
         # What the arguments compute is checked here once, so that it fails at the door.
         joints = state.joint_position.shape[1]
         width = self.action_mode.width(joints)
         check_array(
             "joint targets of the action",
-            self.action_mode.targets(np.zeros((self.num_envs, width)), state, self._worlds)[0],
+            self.action_mode.targets(np.zeros((self.num_envs, width)), state, self._simulator)[0],
             (self.num_envs, joints),
         )
         self._outcome(state)
@@ -268,7 +264,7 @@ class ArmEnv(EnvBase):
         for row in rows:
             self._reset_world(int(row), self._generators[int(row)])
         self._begun = True
-        self._state = self._batch.state(self._elapsed)
+        self._state = self._simulator.state()
         return self._pack(
             observation=self._observe(self._state),
             success=np.zeros((self.num_envs, 1), dtype=bool),
@@ -279,15 +275,13 @@ class ArmEnv(EnvBase):
         if not self._begun:
             raise RuntimeError("ArmEnv must be reset before its first step.")
         action = self._check_action(tensordict.get("action"))
-        joints, fingers = self.action_mode.targets(action, self._state, self._worlds)
+        joints, fingers = self.action_mode.targets(action, self._state, self._simulator)
         if self.scene.motor_limits:
             joints, fingers = self._within_speed(joints, fingers)
-        self._record.add(self._elapsed, joints, fingers)
-        self._batch.advance(joints, fingers)
-        self._elapsed += 1
-        self._state = state = self._batch.state(self._elapsed)
+        self._simulator.advance(joints, fingers)
+        self._state = state = self._simulator.state()
         reward, cost, success = self._outcome(state)
-        truncated = (self._elapsed >= self.max_episode_steps)[:, None] & ~success
+        truncated = (state.step >= self.max_episode_steps)[:, None] & ~success
         return self._pack(
             observation=self._observe(state),
             success=success,
@@ -321,43 +315,37 @@ class ArmEnv(EnvBase):
         self._check_open()
         arrays = {
             "generators": np.stack([pack(generator) for generator in self._generators]),
-            "draws": self._record.draws,
-            "targets": self._record.targets[:, : self._elapsed.max()],
-            "elapsed": self._elapsed,
-            "state": self._batch.table(),
+            "draws": self._draws,
+            **{_PHYSICS + name: array for name, array in self._simulator.save().items()},
         }
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
     def set_extra_state(self, state: Mapping[str, Tensor]) -> None:
-        """Plays the running episodes again up to where they were, as part of ``load_state_dict``.
+        """Brings the running episodes back, as part of ``load_state_dict``.
 
         Raises:
             ValueError: if the state has another number of worlds, or of numbers in each.
         """
         self._check_open()
-        joints = self._state.joint_position.shape[1]
-        saved = state["state"].numpy()
-        if saved.shape != (shape := self._batch.table().shape):
+        arrays = {name: tensor.numpy().copy() for name, tensor in state.items()}
+        if len(arrays["draws"]) != self.num_envs:
             raise ValueError(
-                f"state must be of an environment like this one, whose worlds have the shape "
-                f"{shape}, got {saved.shape}."
+                f"state must be of an environment like this one, of {self.num_envs} worlds, got "
+                f"{len(arrays['draws'])}."
             )
-        for row, steps in enumerate(state["elapsed"].tolist()):
-            self._reset_world(row, unpack(state["draws"][row]))
-            for target in state["targets"][row, :steps].tolist():
-                self._batch.advance_row(row, target[:joints], target[joints:])
+        # A placement may hold a path, which is code: it is drawn again.
+        for row, draws in enumerate(arrays["draws"]):
+            self._reset_world(row, unpack(draws))
+        self._simulator.restore(
+            {
+                name.removeprefix(_PHYSICS): array
+                for name, array in arrays.items()
+                if name.startswith(_PHYSICS)
+            }
+        )
         self._begun = True
-        self._elapsed = state["elapsed"].numpy().copy()
-        self._record.targets = state["targets"].numpy().copy()
-        self._generators = [unpack(packed) for packed in state["generators"]]
-        self._state = self._batch.state(self._elapsed)
-        if not np.array_equal(saved, after := self._batch.table()):
-            warnings.warn(
-                "The running episodes did not come back bit for bit, but with differences of up to "
-                f"{np.abs(after - saved).max():.1e} in their states: they are of another "
-                "environment, another version of PyBullet or another kind of processor.",
-                stacklevel=2,
-            )
+        self._generators = [unpack(packed) for packed in arrays["generators"]]
+        self._state = self._simulator.state()
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -383,11 +371,11 @@ class ArmEnv(EnvBase):
         check_count(width=width, height=height)
         check_kind("camera", camera, Camera)
         self._check_open()
-        return torch.from_numpy(self._batch.pictures(camera, width, height))
+        return torch.from_numpy(self._simulator.pictures(camera, width, height))
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         super().close(raise_if_closed=raise_if_closed)
-        self._batch.close()
+        self._simulator.close()
 
     def _check_open(self) -> None:
         if self.is_closed:
@@ -407,21 +395,20 @@ class ArmEnv(EnvBase):
 
     def _within_speed(self, joints: Array, fingers: Array) -> tuple[Array, Array]:
         # All joints are slowed alike, so that the tool keeps to its path.
-        world, state = self._worlds[0], self._state
+        simulator, state = self._simulator, self._state
         change = joints - state.joint_position
-        longest = world.joint_speed / self.control_rate
+        longest = simulator.joint_speed / self.control_rate
         slowdown = np.maximum(1, np.abs(change / longest).max(axis=1, keepdims=True))
         joints = state.joint_position + change / slowdown
         if not fingers.shape[1]:
             return joints, fingers
-        longest = world.finger_speed / self.control_rate
+        longest = simulator.finger_speed / self.control_rate
         change = np.clip(fingers - state.finger_position, -longest, longest)
         return joints, state.finger_position + change
 
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:
-        self._record.begin(row, generator)
+        self._draws[row] = pack(generator)
         self._starts.begin(row, generator)
-        self._elapsed[row] = 0
 
     def _observe(self, state: ArmState) -> Array:
         fields = self.observation(state).values()

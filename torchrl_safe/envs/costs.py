@@ -11,11 +11,11 @@ from numbers import Real
 
 import numpy as np
 
-from torchrl_safe.envs.checks import check_flag, check_kind, check_not_negative, check_positive
+from torchrl_safe._checks import check_flag, check_kind, check_not_negative, check_positive
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.state import ArmState, Array, Sensing
 
-#: Distance from which on PyBullet reports contact points, m.
+#: Largest distance of a contact point, m.
 CONTACT_RANGE = 0.02
 
 
@@ -28,12 +28,12 @@ class Collision:
 
     with d the distance (m) of the contact points between any link of the arm and any obstacle i
     in any physics substep t: a touch that begins and ends between two control steps is not
-    lost. (Bullet finds contacts at the beginning of a substep: the state in which an episode ends
+    lost. (Contacts are found at the beginning of a substep: the state in which an episode ends
     is the one that is not looked at.) The cost of the paper (Kovač & Farkaš 2023) and of Safety
     Gym (Ray et al. 2019).
 
     Args:
-        margin: distance up to which a contact point counts as a touch, m. PyBullet reports
+        margin: distance up to which a contact point counts as a touch, m. There are
             contact points from 0.02 m before the bodies meet.
         table: count the table too (not what the base stands on).
         itself: count links of the arm that touch each other, unless they overlap at home. They
@@ -54,7 +54,7 @@ class Collision:
     def __post_init__(self) -> None:
         if not isinstance(self.margin, Real) or not 0 <= self.margin <= CONTACT_RANGE:
             raise ValueError(
-                f"margin must be between 0 and {CONTACT_RANGE}, where PyBullet reports contacts, "
+                f"margin must be between 0 and {CONTACT_RANGE}, where contact points begin, "
                 f"got {self.margin}."
             )
         check_flag(table=self.table, itself=self.itself)

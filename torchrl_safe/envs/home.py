@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchrl_safe._checks import check_array, check_kind
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.kinematics import Approach, approach
-from torchrl_safe.envs.scene import Scene
+from torchrl_safe.envs.physics.bullet import Bullet
+from torchrl_safe.envs.physics.scene import Scene
+from torchrl_safe.envs.physics.simulator import Physics, Simulator
 from torchrl_safe.envs.state import Array
 
 # Within m and rad it is there. Below this singular value of the Jacobian, a motion of the tool of
@@ -24,6 +25,8 @@ def find_home(
     arm: ArmModel,
     position: Sequence[float],
     orientation: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+    *,
+    physics: Physics = Bullet(),
 ) -> tuple[float, ...]:
     """Searches joint angles at which the tool is at a pose: the ``home`` of a new arm.
 
@@ -38,11 +41,15 @@ def find_home(
             (x, y, z, w). Defaults to ``(1, 0, 0, 0)``, the tool pointing down; ``(0, 1, 0, 0)``
             does too, turned by half a turn.
 
+    Keyword Args:
+        physics (Physics, optional): the engine that tells where the tool is. Defaults to
+            ``Bullet()``.
+
     Returns:
         The joint angles, rad; the tool is within 1 mm and 1 mrad of the pose.
 
     Raises:
-        TypeError: if ``arm`` is no ArmModel.
+        TypeError: if ``arm`` is no ArmModel or ``physics`` no Physics.
         ValueError: if a pose is not usable, or the search does not get there. The error says what
             has stopped it: the point is out of reach, a joint limit, a singular pose, or a guess
             from which no way leads straight there.
@@ -56,27 +63,28 @@ def find_home(
         [ 0.   -0.77 -0.26  0.    1.02  0.  ]
     """
     check_kind("arm", arm, ArmModel)
+    check_kind("physics", physics, Physics)
     point = check_array("position", position, (3,))
     turned = check_array("orientation", orientation, (4,))
     if not np.isclose(np.linalg.norm(turned), 1, atol=1e-3):
         raise ValueError(f"orientation must be a unit quaternion, got {orientation}.")
-    world = World(arm, Scene(), ())
+    simulator = physics.build(arm, Scene(), num_envs=1)
     try:
         found, free = (
-            approach(world, arm.home, point, turned, respect_limits=limits)
+            approach(simulator, arm.home, point, turned, respect_limits=limits)
             for limits in (True, False)
         )
         for end in (found, free):
-            if _has_arrived(end) and not _beyond_limits(world, end.angles):
+            if _has_arrived(end) and not _beyond_limits(simulator, end.angles):
                 return tuple(end.angles.tolist())
         raise ValueError(
             f"position and orientation must be a pose that the arm gets to from its home, got "
             f"{point.tolist()} and {turned.tolist()}, from which the tool stays "
             f"{found.distance:.3f} m and {found.turn:.3f} rad away: "
-            f"{_what_stopped(arm, world, point, found, free)}"
+            f"{_what_stopped(arm, simulator, point, found, free)}"
         )
     finally:
-        world.close()
+        simulator.close()
 
 
 def _has_arrived(found: Approach) -> bool:
@@ -84,18 +92,18 @@ def _has_arrived(found: Approach) -> bool:
 
 
 def _what_stopped(
-    arm: ArmModel, world: World, point: Array, found: Approach, free: Approach
+    arm: ArmModel, simulator: Simulator, point: Array, found: Approach, free: Approach
 ) -> str:
-    nearest = _nearest(world, arm.home, point)
+    nearest = _nearest(simulator, arm.home, point)
     if nearest > _ARRIVED:
         return (
             f"it is out of reach, {nearest:.3f} m beyond all that the tool gets to however it is "
             "turned and whatever the joint limits."
         )
     if _has_arrived(free):
-        beyond = ", ".join(_beyond_limits(world, free.angles))
+        beyond = ", ".join(_beyond_limits(simulator, free.angles))
         return f"a joint limit stopped it: {beyond}. Guess another home."
-    values = np.linalg.svd(np.array(world.jacobian(found.angles.tolist())), compute_uv=False)
+    values = np.linalg.svd(simulator.jacobian(found.angles[None])[0], compute_uv=False)
     weakest = values.min() if len(values) == 6 else 0.0  # With fewer than six joints.
     if weakest < _SINGULAR:
         return (
@@ -106,24 +114,24 @@ def _what_stopped(
     return "no way leads there from the guess. Guess another home."
 
 
-def _nearest(world: World, home: Sequence[float], point: Array) -> float:
+def _nearest(simulator: Simulator, home: Sequence[float], point: Array) -> float:
     """How near the tool gets to a point, m, from several starts and beyond all limits."""
     generator = np.random.default_rng(0)
-    lower = np.maximum(world.joint_lower, -np.pi)
-    upper = np.minimum(world.joint_upper, np.pi)
-    nearest = approach(world, home, point, respect_limits=False).distance
+    lower = np.maximum(simulator.joint_lower, -np.pi)
+    upper = np.minimum(simulator.joint_upper, np.pi)
+    nearest = approach(simulator, home, point, respect_limits=False).distance
     for _ in range(_STARTS):
         if nearest < _ARRIVED:
             break
         start = generator.uniform(lower, upper)
-        again = approach(world, start, point, respect_limits=False)
+        again = approach(simulator, start, point, respect_limits=False)
         nearest = min(nearest, again.distance)
     return nearest
 
 
-def _beyond_limits(world: World, angles: Array) -> list[str]:
+def _beyond_limits(simulator: Simulator, angles: Array) -> list[str]:
     """Which joints would have to go beyond their limits, and where to."""
-    limits = zip(world.joint_lower, world.joint_upper, strict=True)
+    limits = zip(simulator.joint_lower, simulator.joint_upper, strict=True)
     return [
         f"joint {number}, counted from the base, would have to be at {angle:.3f} rad and goes from "
         f"{lower:.3f} to {upper:.3f}"

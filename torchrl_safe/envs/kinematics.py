@@ -8,8 +8,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from torchrl_safe.envs.bullet import World
-from torchrl_safe.envs.checks import check_positive
+from torchrl_safe._checks import check_positive
+from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import rotation_vector
 from torchrl_safe.envs.state import ArmState, Array
 
@@ -20,7 +20,7 @@ class InverseKinematics(Protocol):
     """Turns tool poses into joint angles."""
 
     def __call__(
-        self, position: Array, orientation: Array, state: ArmState, worlds: Sequence[World]
+        self, position: Array, orientation: Array, state: ArmState, simulator: Simulator
     ) -> Array:
         """Returns joint angles, rad, ``(N, n)``.
 
@@ -28,7 +28,8 @@ class InverseKinematics(Protocol):
             position: wanted tool points, m, ``(N, 3)``.
             orientation: wanted tool orientations, quaternions (x, y, z, w), ``(N, 4)``.
             state: the current state.
-            worlds: the N worlds.
+            simulator: gives Jacobians, see
+                :class:`~torchrl_safe.envs.Simulator`.
         """
 
 
@@ -60,12 +61,10 @@ class DampedLeastSquares:
         check_positive(damping=self.damping)
 
     def __call__(
-        self, position: Array, orientation: Array, state: ArmState, worlds: Sequence[World]
+        self, position: Array, orientation: Array, state: ArmState, simulator: Simulator
     ) -> Array:
         angles = state.joint_position
-        jacobian = np.array(
-            [world.jacobian(row) for world, row in zip(worlds, angles.tolist(), strict=True)]
-        )
+        jacobian = simulator.jacobian(angles)
         error = np.concatenate(
             [
                 position - state.ee_position,
@@ -77,27 +76,6 @@ class DampedLeastSquares:
         damped = jacobian @ transposed + self.damping**2 * np.eye(6)
         change = transposed @ np.linalg.solve(damped, error[:, :, None])
         return np.clip(angles + change[:, :, 0], state.joint_lower, state.joint_upper)
-
-
-@dataclass(frozen=True)
-class BulletInverseKinematics:
-    """PyBullet's own solver with its defaults: 20 iterations, no joint limits.
-
-    Only for the paper's environment: it is slower and less exact than
-    :class:`DampedLeastSquares`.
-    """
-
-    def __call__(
-        self, position: Array, orientation: Array, state: ArmState, worlds: Sequence[World]
-    ) -> Array:
-        return np.array(
-            [
-                world.inverse_kinematics(*pose)
-                for world, *pose in zip(
-                    worlds, position.tolist(), orientation.tolist(), strict=True
-                )
-            ]
-        )
 
 
 class Approach(NamedTuple):
@@ -112,7 +90,7 @@ class Approach(NamedTuple):
 
 
 def approach(
-    world: World,
+    simulator: Simulator,
     start: Sequence[float] | Array,
     position: Array,
     orientation: Array | None = None,
@@ -122,11 +100,11 @@ def approach(
 ) -> Approach:
     """Searches joint angles that bring the tool to a pose, by damped least squares.
 
-    It goes downhill from where it starts, and may stop where only a detour leads on. The world
-    is to be reset afterwards.
+    It goes downhill from where it starts, and may stop where only a detour leads on. The worlds
+    are to be reset afterwards.
 
     Args:
-        world: the world.
+        simulator: the worlds.
         start: joint angles to begin from, rad, ``(n,)``.
         position: where the tool is to get, m, ``(3,)``.
         orientation: how it is to be turned, a quaternion (x, y, z, w), ``(4,)``. ``None`` leaves
@@ -137,7 +115,7 @@ def approach(
     angles = np.array(start, dtype=float)
     best = Approach(angles, np.inf, np.inf)
     for _ in range(_ITERATIONS):
-        tool, turned = map(np.array, world.tool_at(angles.tolist()))
+        tool, turned = (part[0] for part in simulator.tool_at(angles[None]))
         way = position - tool
         parts = [way]
         if orientation is not None:
@@ -149,11 +127,11 @@ def approach(
             break
         # Far away the Jacobian is no guide: steps are short.
         error = np.concatenate([_shortened(part) for part in parts])
-        jacobian = np.array(world.jacobian(angles.tolist())[: len(error)])
+        jacobian = simulator.jacobian(angles[None])[0, : len(error)]
         damped = jacobian @ jacobian.T + _DAMPING * np.eye(len(error))
         angles = angles + jacobian.T @ np.linalg.solve(damped, error)
         if respect_limits:
-            angles = np.clip(angles, world.joint_lower, world.joint_upper)
+            angles = np.clip(angles, simulator.joint_lower, simulator.joint_upper)
     return best
 
 
@@ -161,15 +139,15 @@ def _shortened(error: Array) -> Array:
     return error * min(1.0, _LONGEST_STEP / max(float(np.linalg.norm(error)), 1e-9))
 
 
-def distance_to_reach(world: World, start: Sequence[float], point: Array) -> float:
+def distance_to_reach(simulator: Simulator, start: Sequence[float], point: Array) -> float:
     """Returns how far from a point the tool stays, m, however it is turned; 0 if it gets there.
 
-    The world is to be reset afterwards.
+    The worlds are to be reset afterwards.
 
     Args:
-        world: the world.
+        simulator: the worlds.
         start: joint angles to begin from, rad, ``(n,)``.
         point: where the tool is to get, m, ``(3,)``.
     """
-    distance = approach(world, start, point, arrived=_ARRIVED).distance
+    distance = approach(simulator, start, point, arrived=_ARRIVED).distance
     return 0.0 if distance < _ARRIVED else distance

@@ -12,12 +12,12 @@ from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
 from torchrl_safe.envs.arms import PANDA
 from torchrl_safe.envs.costs import CONTACT_RANGE, Collision
-from torchrl_safe.envs.kinematics import BulletInverseKinematics
 from torchrl_safe.envs.observations import paper_observation
 from torchrl_safe.envs.obstacles import InFront
+from torchrl_safe.envs.obstacles.shapes import Cylinder
+from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
+from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.regions import Region
-from torchrl_safe.envs.scene import Scene
-from torchrl_safe.envs.shapes import Cylinder
 from torchrl_safe.envs.tasks import Reach
 
 #: AR1: displacements of the tool point and the position of the fingers, not clipped.
@@ -42,13 +42,11 @@ PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
         "observation": paper_observation,
         "frame_skip": 1,
         "max_episode_steps": 500,
-        "scene": Scene(
-            gravity=10.0,
+        "scene": Scene(gravity=10.0, free_fingers=True, motor_limits=False),
+        "physics": Bullet(
             furniture=(("plane.urdf", (0, 0, -0.65)), ("table/table.urdf", (0.5, 0, -0.65))),
             target_urdf="lego/lego.urdf",
-            free_fingers=True,
             merged_links=False,
-            motor_limits=False,
             motor_gain=0.1,
             urdf_inertia=True,
             fresh_links=False,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs.checks import check_array
+from torchrl_safe._checks import check_array
 from torchrl_safe.envs.state import Array
 
 

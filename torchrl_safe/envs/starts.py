@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_safe._checks import check_array, check_kind
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.batch import WorldBatch
-from torchrl_safe.envs.checks import check_array, check_kind
 from torchrl_safe.envs.kinematics import distance_to_reach
 from torchrl_safe.envs.obstacles import Obstacles, Placement
+from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.regions import NoRoomError
 from torchrl_safe.envs.state import Array
 from torchrl_safe.envs.tasks import Task
@@ -31,11 +31,13 @@ class Starts:
         arm: the arm.
         task: what draws goal and objects.
         obstacles: what draws where the obstacles are.
-        batch: the worlds.
+        simulator: the worlds.
     """
 
-    def __init__(self, arm: ArmModel, task: Task, obstacles: Obstacles, batch: WorldBatch) -> None:
-        self._arm, self._task, self._obstacles, self._batch = arm, task, obstacles, batch
+    def __init__(
+        self, arm: ArmModel, task: Task, obstacles: Obstacles, simulator: Simulator
+    ) -> None:
+        self._arm, self._task, self._obstacles, self._simulator = arm, task, obstacles, simulator
 
     def check(self) -> None:
         """Tries some.
@@ -51,7 +53,7 @@ class Starts:
             goal, objects = self._begin(0, generator, _CHECKED_DRAWS)
             for name, points in (("goals", goal[None]), ("objects", objects)):
                 for point in points:
-                    miss = distance_to_reach(self._batch.worlds[0], self._arm.home, point)
+                    miss = distance_to_reach(self._simulator, self._arm.home, point)
                     if miss > _REACHED:
                         raise ValueError(
                             f"task must draw {name} that the arm can reach, got "
@@ -74,7 +76,7 @@ class Starts:
             try:
                 goal, objects = self._draw_task(generator)
                 placement = self._draw_obstacles(generator, goal, objects)
-                self._batch.reset(row, placement, goal, objects)
+                self._simulator.reset(row, placement, goal, objects)
                 self._check_free(row)
             except NoRoomError as error:
                 last = error
@@ -83,7 +85,7 @@ class Starts:
         raise ValueError(f"{last} None of {draws} draws of {self._task} was usable.")
 
     def _check_free(self, row: int) -> None:
-        if (clearance := self._batch.worlds[row].clearance()) <= 0:
+        if (clearance := self._simulator.clearance(row)) <= 0:
             raise NoRoomError(
                 f"obstacles must leave the arm free at home and the objects where they are, got an "
                 f"overlap of {-clearance:.4f} m from {self._obstacles}."
@@ -97,7 +99,7 @@ class Starts:
     def _draw_obstacles(
         self, generator: np.random.Generator, goal: Array, objects: Array
     ) -> Placement:
-        start = objects[0] if len(objects) else np.array(self._batch.worlds[0].home_position)
+        start = objects[0] if len(objects) else self._simulator.home_position
         placement = self._obstacles.sample(generator, start, goal)
         check_kind("placement", placement, Placement)
         shapes = self._obstacles.shapes

@@ -9,7 +9,7 @@ from typing import NoReturn, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs.checks import check_flag, check_not_negative
+from torchrl_safe._checks import check_flag, check_not_negative
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs.checks import check_flag, check_kind, check_positive
+from torchrl_safe._checks import check_flag, check_kind, check_positive
+from torchrl_safe.envs.obstacles.shapes import Box, Shape
 from torchrl_safe.envs.regions import NoRoomError, Region
-from torchrl_safe.envs.shapes import Box, Shape
 from torchrl_safe.envs.state import ArmState, Array
 
 _ATTEMPTS, _PAIRS = 30, 64

@@ -1,0 +1,330 @@
+"""What MuJoCo's worlds are of their own: rows of numbers that can be written, saved and shared."""
+
+import os
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from worlds import ARMS, Places, each_arm, rest, step
+
+from torchrl_safe.envs import (
+    PANDA,
+    UR5,
+    ArmEnv,
+    Box,
+    Camera,
+    CartesianDelta,
+    Collision,
+    Cylinder,
+    Human,
+    InFront,
+    JointDelta,
+    JointLimit,
+    Moving,
+    NoObstacles,
+    PickAndPlace,
+    Push,
+    Scattered,
+    Scene,
+    Sensing,
+    Speed,
+    SpeedAndSeparation,
+    Sphere,
+    Swing,
+)
+from torchrl_safe.envs.physics.mujoco import MuJoCo
+from torchrl_safe.envs.physics.mujoco.chain import Chain
+from torchrl_safe.envs.physics.mujoco.model import build_world
+
+ONE = MuJoCo(threads=1)
+EVERYTHING = {
+    "touch": Collision(table=True, itself=True),
+    "apart": SpeedAndSeparation(),
+    "limit": JointLimit(),
+    "speed": Speed(any_link=True),
+}
+# Between them all kinds of bodies: put in place, on a way, free, absent, held by fingers.
+EPISODES = {
+    "static": {},
+    "human": {"obstacles": Human(), "costs": EVERYTHING},
+    "moving": {"obstacles": Moving(Scattered(fewest=0), Swing()), "costs": EVERYTHING},
+    "free": {"obstacles": Scattered(fewest=0, shape=Cylinder(mass=0.5)), "costs": EVERYTHING},
+    "push": {"task": Push()},
+    "pick": {"task": PickAndPlace(), "action": CartesianDelta(finger_step=0.04)},
+}
+each_episode = pytest.mark.parametrize("settings", EPISODES.values(), ids=EPISODES)
+
+
+def play(env, steps, seed=0, first=0):
+    """The states that random actions lead to, as rows of numbers."""
+    generator = torch.Generator().manual_seed(seed)
+    actions = 2 * torch.rand(first + steps, *env.action_spec.shape[1:], generator=generator) - 1
+    states = []
+    for action in actions[first:]:
+        step(env, action)
+        states.append(numbers(env.arm_state))
+    return np.array(states)
+
+
+def numbers(state):
+    """All that an ArmState tells of each world, ``(N, width)``."""
+    shared = ("joint_lower", "joint_upper", "obstacle_size", "trace")
+    parts = [part for name, part in vars(state).items() if name not in shared]
+    parts += state.trace.values()
+    return np.concatenate([np.reshape(part, (len(state.goal), -1)) for part in parts], axis=1)
+
+
+@each_episode
+def test_worlds_are_alike_alone_and_among_others(make_env, settings):
+    """Bit for bit: nothing of a world shows in another, on any number of threads."""
+    both = make_env(ArmEnv, num_envs=3, physics=MuJoCo(threads=2), seed=5, **settings)
+    both.reset()
+    together = play(both, 12)
+    single = make_env(ArmEnv, num_envs=3, physics=ONE, seed=5, **settings)
+    single.reset()
+    np.testing.assert_array_equal(play(single, 12), together)
+    alone = make_env(ArmEnv, num_envs=1, physics=ONE, seed=5, **settings)
+    alone.reset()
+    np.testing.assert_array_equal(play(alone, 12)[:, 0], together[:, 0])
+
+
+@each_episode
+def test_partial_resets_leave_the_others_alone(make_env, settings):
+    settings = {**settings, "num_envs": 3, "physics": ONE, "max_episode_steps": 1000}
+    untouched, other = (make_env(ArmEnv, seed=5, **settings) for _ in range(2))
+    for env in (untouched, other):
+        env.reset()
+        play(env, 5)
+    rows = other._simulator._batch.state.copy()
+    other.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
+    np.testing.assert_array_equal(other._simulator._batch.state[[0, 2]], rows[[0, 2]])
+    expected, after = (play(env, 6, seed=1) for env in (untouched, other))
+    np.testing.assert_array_equal(after[:, [0, 2]], expected[:, [0, 2]])
+    assert not np.array_equal(after[:, 1], expected[:, 1])
+
+
+@each_episode
+@pytest.mark.parametrize(
+    "steps", [0, 20, *(pytest.param(s, marks=pytest.mark.slow) for s in (7, 26))]
+)
+def test_checkpoints_come_back_bit_for_bit(make_env, settings, steps):
+    """In another environment with another past, at the beginning and after any number of steps."""
+    settings = {**settings, "num_envs": 2, "physics": ONE, "max_episode_steps": 1000}
+    first, second = (make_env(ArmEnv, seed=seed, **settings) for seed in (5, 6))
+    first.reset()
+    play(first, steps)
+    second.reset()
+    play(second, 9, seed=3)
+    checkpoint = first.state_dict()
+    second.load_state_dict(checkpoint)
+    np.testing.assert_array_equal(numbers(second.arm_state), numbers(first.arm_state))
+    np.testing.assert_array_equal(play(second, 30, seed=1), play(first, 30, seed=1))
+    for env in (first, second):
+        env.reset()
+    np.testing.assert_array_equal(numbers(second.arm_state), numbers(first.arm_state))
+
+
+def test_checkpoints_of_other_worlds_are_refused(make_env):
+    small = make_env(ArmEnv, physics=ONE, seed=0)
+    large = make_env(ArmEnv, physics=ONE, num_envs=2, seed=0)
+    for env in (small, large):
+        env.reset()
+    saved = small._simulator.save()
+    with pytest.raises(ValueError, match="state must be of an environment like this one"):
+        large._simulator.restore(saved)
+    del saved["steps"]
+    with pytest.raises(ValueError, match=r"steps must be .* got nothing"):
+        small._simulator.restore(saved)
+
+
+def test_checkpoints_of_other_obstacles_are_told(make_env):
+    env = make_env(ArmEnv, physics=ONE, seed=0)
+    env.reset()
+    saved = env._simulator.save()
+    env.reset()
+    with pytest.warns(UserWarning, match="did not come back bit for bit: their obstacles are"):
+        env._simulator.restore(saved)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, 1e12])
+def test_a_broken_world_is_named(make_env, tmp_path, monkeypatch, number):
+    """MuJoCo by itself would begin that world anew, and write a file into the working directory."""
+    monkeypatch.chdir(tmp_path)
+    env = make_env(ArmEnv, num_envs=3, physics=ONE, obstacles=NoObstacles(), seed=0)
+    env.reset()
+    env._simulator._qvel[1, 0] = number
+    with pytest.raises(FloatingPointError, match="world 1 is not finite or unstable"):
+        rest(env)
+    assert not list(tmp_path.iterdir())
+    # The others go on when it is reset.
+    env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
+    rest(env)
+    assert np.isfinite(env.arm_state.joint_position).all()
+
+
+def test_others_hear_of_their_own_warnings(tmp_path, monkeypatch):
+    """We silence MuJoCo for our own steps only."""
+    monkeypatch.chdir(tmp_path)
+    ArmEnv(physics=ONE, seed=0).rollout(1)
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    data.qvel[0] = np.nan
+    mujoco.mj_step(model, data)
+    assert (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_absent_bodies_stay_away(make_env):
+    """They do not fall for ever: after a long time they are where they were."""
+    places = Places(
+        Cylinder(mass=1.0), Sphere(0.05), at=[(0.6, 0.2, 0.1)] * 2, present=[False, False]
+    )
+    env = make_env(ArmEnv, physics=ONE, obstacles=places, max_episode_steps=10**6, seed=0)
+    env.reset()
+    before = env.arm_state
+    rest(env, 500)
+    for name in ("position", "orientation", "velocity", "angular_velocity"):
+        now = getattr(env.arm_state, f"obstacle_{name}")
+        np.testing.assert_array_equal(now, getattr(before, f"obstacle_{name}"))
+    assert (env._simulator._qpos[:, env._simulator._free._position[:, 2]] < -99).all()
+
+
+def test_fingers_that_no_action_moves_are_not_driven(make_env):
+    """Free, and without a motor they are moved by the hand; driven again, they do as told."""
+    simulator = ONE.build(PANDA, Scene(free_fingers=True), num_envs=1)
+    placement = NoObstacles().sample(np.random.default_rng(0), np.zeros(3), np.ones(3))
+    simulator.reset(0, placement, np.zeros(3), np.zeros((0, 3)))
+    joints = simulator.state().joint_position
+    simulator.advance(joints, np.full((1, 2), 0.01))
+    simulator.advance(joints, np.full((1, 2), 0.02))
+    np.testing.assert_allclose(simulator.state().finger_position, 0.02, atol=1e-3)
+    simulator._qvel[:, simulator._driven_speed[-2:]] = 0.05
+    simulator.advance(joints, np.zeros((1, 0)))
+    free = simulator.state().finger_position
+    # Nothing slows them down.
+    np.testing.assert_allclose(free, 0.02 + 0.05 * 0.05, atol=1e-3)
+    simulator.advance(joints, free - 0.005)
+    np.testing.assert_allclose(simulator.state().finger_position, free - 0.005, atol=1e-3)
+
+
+@each_arm
+def test_kinematics_are_those_of_mujoco(arm):
+    world = build_world(arm, Scene(), (), (), Sensing())
+    model, data = world.model, mujoco.MjData(world.model)
+    chain = Chain(model, world.parts.joints, world.parts.tool)
+    angles = np.random.default_rng(0).uniform(-3, 3, (20, len(arm.home)))
+    tool = chain(angles)
+    body = model.body(world.parts.tool).id
+    for row, pose in enumerate(angles):
+        data.qpos[world.position] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        jacobian = np.zeros((6, model.nv))
+        mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], data.xpos[body], body)
+        np.testing.assert_allclose(tool.position[row], data.xpos[body], atol=1e-12)
+        turn = tool.orientation[row] @ data.xquat[body][[1, 2, 3, 0]]
+        assert abs(turn) == pytest.approx(1, abs=1e-12)
+        np.testing.assert_allclose(tool.jacobian[row], jacobian[:, world.velocity], atol=1e-12)
+
+
+@each_arm
+@pytest.mark.parametrize(
+    ("step_size", "quantiles"), [(0.03, (0.05, 0.95)), (0.1, (0.3, 0.7))], ids=["small", "large"]
+)
+def test_an_action_does_what_it_asks_for(make_env, arm, step_size, quantiles):
+    """To within 5 %; efforts do not allow every change of 0.1 rad in 0.05 s."""
+    env = make_env(
+        ArmEnv,
+        arm,
+        num_envs=8,
+        physics=ONE,
+        action=JointDelta(step=step_size),
+        obstacles=NoObstacles(),
+        max_episode_steps=1000,
+        seed=0,
+    )
+    env.reset()
+    home, generator = np.array(arm.home), np.random.default_rng(0)
+    done = []
+    longest = (env._simulator.joint_speed / env.control_rate).min()
+    for _ in range(20):
+        before = env.arm_state.joint_position
+        # Back to where there is room, on average; and no faster than any joint may be.
+        action = np.clip(generator.uniform(-1, 1, before.shape) - (before - home), -1, 1)
+        action *= min(1, 0.999 * longest / step_size)
+        step(env, action)
+        moved = env.arm_state.joint_position - before
+        done.append((moved / (action * step_size))[np.abs(action) > 0.5])
+    low, high = np.quantile(np.concatenate(done), quantiles)
+    assert 0.95 < low < high < 1.05
+
+
+def test_threads_are_the_cores_that_are_ours(monkeypatch):
+    from torchrl_safe.envs.physics.mujoco import physics
+
+    assert physics._cores() == len(os.sched_getaffinity(0))
+    monkeypatch.setattr(physics.multiprocessing, "parent_process", lambda: object())
+    assert physics._cores() == 1
+    for threads in (0, 1.5, True):
+        with pytest.raises(ValueError, match="threads must be"):
+            MuJoCo(threads=threads)
+
+
+def test_there_is_no_window(make_env):
+    with pytest.raises(ValueError, match="gui must be False with MuJoCo"):
+        ArmEnv(physics=ONE, gui=True)
+
+
+def test_a_missing_mujoco_is_told_when_a_world_is_made():
+    code = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "from torchrl_safe.envs.physics.mujoco import MuJoCo\n"
+        "from torchrl_safe.envs import PANDA, Scene\n"
+        "MuJoCo().build(PANDA, Scene(), num_envs=1)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert 'pip install "torchrl-safe[mujoco]"' in result.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("arm", [PANDA, UR5], ids=["panda", "ur5"])
+def test_pictures_show_what_there_is(make_env, arm):
+    """Obstacles red, the object blue, the goal yellow: each only where it is."""
+    env = make_env(ArmEnv, arm, num_envs=2, physics=ONE, task=Push(), obstacles=InFront(), seed=0)
+    env.reset()
+    state = env._simulator._batch.state.copy()
+    above = Camera(eye=(0.5, -0.8, 1.5), target=(0.5, 0.0, 0.0))
+    first = env.render(320, 240, above)
+    assert first.shape == (2, 240, 320, 3)
+    assert first.dtype == torch.uint8
+    assert torch.equal(env.render(320, 240, above), first)
+    for picture in first.int():
+        red, green, blue = picture.unbind(-1)
+        assert ((red > 2 * green) & (red > 2 * blue)).sum() > 100
+        assert ((blue > 2 * red) & (blue > 1.3 * green)).sum() > 5
+        assert ((red > 2 * blue) & (green > 2 * blue)).sum() > 5
+    assert not torch.equal(first[0], first[1])
+    assert env.render(80, 60).shape == (2, 60, 80, 3)
+    np.testing.assert_array_equal(env._simulator._batch.state, state)
+    rest(env)
+    step(env, 1.0)
+    assert not torch.equal(env.render(320, 240, above), first)
+
+
+def test_arms_of_the_gymnasium_names_all_load():
+    assert len(ARMS) == 6
+
+
+def test_boxes_have_their_weight(make_env, turntable):
+    """Two boxes at rest on the bar: a contact each, whose force is what they weigh."""
+    heavy, light = Box((0.04, 0.04, 0.04), mass=2.0), Box((0.04, 0.04, 0.04), mass=0.5)
+    turntable["obstacles"] = Places(heavy, light, at=[(0.15, 0, 0.561), (-0.15, 0, 0.561)])
+    env = make_env(ArmEnv, **turntable, physics=ONE)
+    env.reset()
+    rest(env, 40)
+    np.testing.assert_allclose(env.arm_state.contact_force, [[19.62, 4.905]], rtol=0.02)
+    assert (np.abs(env.arm_state.contact_distance) < 2e-3).all()

@@ -1,0 +1,138 @@
+"""Robot arms as data. Limits, efforts and the joint chain are read from the URDF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torchrl_safe._checks import check_array, check_kind
+from torchrl_safe.envs.regions import Region
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """A gripper that can be mounted on any arm. Its fingers open alike, as if by a gear.
+
+    Args:
+        urdf: path of the URDF file, as that of an :class:`ArmModel`.
+        tool_link: name of the gripper's link whose frame is the tool point.
+        position: where the gripper's root link is mounted, in the frame of the arm's
+            ``ee_link``, m.
+        rotation: how it is turned there: roll, pitch and yaw, rad.
+
+    Raises:
+        ValueError: if ``position`` or ``rotation`` is not three finite numbers. A file or link
+            that does not fit raises it where the world is built.
+
+    Examples:
+        >>> Gripper("gripper.urdf", "tool", position=(0.0, 0.0, 0.045)).rotation
+        (0.0, 0.0, 0.0)
+    """
+
+    urdf: str
+    tool_link: str
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_array("position", self.position, (3,))
+        check_array("rotation", self.rotation, (3,))
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """A robot arm.
+
+    The arm's joints are the movable joints between the base and ``ee_link``. Every other joint
+    (a gripper's fingers) is fixed, unless the :class:`~torchrl_safe.envs.Scene` leaves it free.
+
+    Args:
+        urdf: path of the URDF file, absolute or relative to ``pybullet_data``, to the robots of
+            ``example-robot-data`` (the ``more-arms`` extra) or to the working directory.
+        ee_link: name of the end-effector link. Its frame is the tool point, unless a gripper
+            is mounted on it.
+        home: joint angles at the start of an episode, in radians, one for each joint of the
+            arm. Cartesian actions keep the tool orientation of this pose.
+        goals: where goals can be reached with the tool held as at home, in the frame of the
+            arm's base, m.
+        finger_home: position of the joints that are not part of the arm, in metres, where they
+            are free.
+        gripper: what is mounted on ``ee_link``; its ``tool_link`` then is the tool point.
+
+    Raises:
+        TypeError: if ``goals`` or ``gripper`` is not of its kind. A file, link or home pose that
+            does not fit raises ValueError where the world is built.
+
+    Examples:
+        >>> iiwa = ArmModel("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", (0, 0.4, 0, -2, 0, 0.74, 0))
+        >>> iiwa.ee_link
+        'lbr_iiwa_link_7'
+    """
+
+    urdf: str
+    ee_link: str
+    home: tuple[float, ...]
+    goals: Region = Region((0.6, -0.2, 0.05), (0.7, 0.2, 0.15))
+    finger_home: float = 0.0
+    gripper: Gripper | None = None
+
+    def __post_init__(self) -> None:
+        check_kind("goals", self.goals, Region)
+        check_array("finger_home", self.finger_home, ())
+        if self.gripper is not None:
+            check_kind("gripper", self.gripper, Gripper)
+
+
+#: A small parallel gripper of our own for any flange: 0.5 kg, opens by 0.04 m to each side.
+PARALLEL_GRIPPER = Gripper("gripper.urdf", tool_link="tool")
+
+#: Franka Emika Panda with its hand closed; at home the tool points down at (0.35, 0, 0.2) m.
+PANDA = ArmModel(
+    urdf="franka_panda/panda.urdf",
+    ee_link="panda_grasptarget",
+    home=(0.0, -0.395, 0.0, -2.849, 0.0, 2.454, 0.7854),
+)
+
+#: KUKA LBR iiwa 14; at home the tool points down at (0.42, 0, 0.25) m: its elbow cannot fold
+#: further, and its reach with the tool down ends at 0.8 m, which leaves a narrow strip of goals.
+IIWA = ArmModel(
+    urdf="kuka_iiwa/model.urdf",
+    ee_link="lbr_iiwa_link_7",
+    home=(0.0, 0.3292, 0.0, -2.0221, 0.0, 0.7903, 0.0),
+    goals=Region((0.65, -0.2, 0.05), (0.7, 0.2, 0.15)),
+    # The link's frame lies inside its body; the flange is 45 mm further out.
+    gripper=replace(PARALLEL_GRIPPER, position=(0.0, 0.0, 0.045)),
+)
+
+#: UFACTORY xArm 6; at home the tool points down at (0.25, 0, 0.2) m.
+XARM6 = ArmModel(
+    urdf="xarm/xarm6_robot.urdf",
+    ee_link="link6",
+    home=(0.0, -0.7665, -0.257, 0.0, 1.0235, 0.0),
+    goals=Region((0.48, -0.2, 0.05), (0.58, 0.2, 0.15)),
+    gripper=PARALLEL_GRIPPER,
+)
+
+#: UFACTORY xArm 7; at home the tool points down at (0.25, 0, 0.2) m. Needs ``more-arms``.
+XARM7 = ArmModel(
+    urdf="xarm_description/urdf/xarm7.urdf",
+    ee_link="link_eef",
+    home=(0.0, -0.7224, 0.0, 0.2634, 0.0, 0.9858, 0.0),
+    goals=Region((0.48, -0.2, 0.05), (0.58, 0.2, 0.15)),
+    gripper=PARALLEL_GRIPPER,
+)
+
+#: Universal Robots UR5; at home the tool points down at (0.35, 0, 0.2) m. Needs ``more-arms``.
+UR5 = ArmModel(
+    urdf="ur_description/urdf/ur5_robot.urdf",
+    ee_link="tool0",
+    home=(-0.3171, -1.9041, 2.1843, -1.851, -1.5708, 1.2536),
+    gripper=PARALLEL_GRIPPER,
+)
+
+#: Universal Robots UR10; at home the tool points down at (0.35, 0, 0.2) m. Needs ``more-arms``.
+UR10 = ArmModel(
+    urdf="ur_description/urdf/ur10_robot.urdf",
+    ee_link="tool0",
+    home=(-0.4875, -2.1153, 2.5841, -2.0396, -1.5708, 1.0833),
+    gripper=PARALLEL_GRIPPER,
+)

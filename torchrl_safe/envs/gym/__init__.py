@@ -1,0 +1,43 @@
+"""Gymnasium, both ways: arms for Gymnasium's users, and Gymnasium's environments with a cost.
+
+Importing this module registers the ready-made combinations of an arm, a task, obstacles and an
+action as ``torchrl_safe/<Arm><Task><Obstacles><Action>-v0``; the names are the keys of ``ARMS``,
+``TASKS``, ``OBSTACLES`` and ``ACTIONS``. Gymnasium's own syntax imports it on the way:
+``gymnasium.make("torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0")``.
+"""
+
+from itertools import product
+
+try:
+    import gymnasium
+except ImportError as error:
+    raise ImportError(
+        'torchrl_safe.envs.gym needs Gymnasium: pip install "torchrl-safe[arms]".'
+    ) from error
+
+from torchrl_safe.envs.gym.arm import ArmGymEnv
+from torchrl_safe.envs.gym.registered import ACTIONS, ARMS, OBSTACLES, TASKS, combination
+from torchrl_safe.envs.gym.safe import SafeGymEnv, SafeGymWrapper
+
+__all__ = [
+    "ACTIONS",
+    "ARMS",
+    "OBSTACLES",
+    "TASKS",
+    "ArmGymEnv",
+    "SafeGymEnv",
+    "SafeGymWrapper",
+    "combination",
+]
+
+
+def _register() -> None:
+    for parts in product(ARMS, TASKS, OBSTACLES, ACTIONS):
+        gymnasium.register(
+            f"torchrl_safe/{''.join(parts)}-v0",
+            entry_point=f"{__name__}:{ArmGymEnv.__name__}",
+            kwargs=combination(*parts),
+        )
+
+
+_register()

@@ -1,0 +1,59 @@
+"""The ready-made combinations: the parts of their names, and what they stand for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from torchrl_safe.envs.actions import CartesianDelta, JointDelta
+from torchrl_safe.envs.arms import IIWA, PANDA, UR5, UR10, XARM6, XARM7
+from torchrl_safe.envs.obstacles import Human, InFront, Moving, NoObstacles, Obstacles, Scattered
+from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
+
+#: The parts of the registered names, and what they stand for.
+ARMS = {
+    "Panda": PANDA,
+    "Iiwa": IIWA,
+    "XArm6": XARM6,
+    "XArm7": XARM7,
+    "UR5": UR5,
+    "UR10": UR10,
+}
+TASKS: dict[str, Task] = {"Reach": Reach(), "Push": Push(), "PickAndPlace": PickAndPlace()}
+# Control steps of an episode, at 20 Hz; mostly enough for the scripted pilots of the tests.
+_TIME_LIMITS = {"Reach": 40, "Push": 200, "PickAndPlace": 100}
+OBSTACLES: dict[str, Obstacles] = {
+    "": NoObstacles(),
+    "InFront": InFront(),
+    "Scattered": Scattered(),
+    "Moving": Moving(),
+    "Human": Human(),
+}
+ACTIONS: dict[str, CartesianDelta | JointDelta] = {"": CartesianDelta(), "Joint": JointDelta()}
+
+
+def combination(arm: str, task: str, obstacles: str, action: str) -> dict[str, Any]:
+    """Returns the arguments of :class:`~torchrl_safe.envs.ArmEnv` for the parts of a name.
+
+    Args:
+        arm: key of ``ARMS``.
+        task: key of ``TASKS``; decides on the time limit too: 40 control steps for ``Reach``, 200
+            for ``Push``, 100 for ``PickAndPlace``.
+        obstacles: key of ``OBSTACLES``.
+        action: key of ``ACTIONS``. To pick something up, it moves the fingers too.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> env = ArmEnv(num_envs=2, **combination("Panda", "PickAndPlace", "Human", "Joint"))
+        >>> env.action_spec.shape, env.max_episode_steps
+        (torch.Size([2, 8]), 100)
+        >>> env.close()
+    """
+    grasps = isinstance(TASKS[task], PickAndPlace)
+    return {
+        "arm": ARMS[arm],
+        "task": TASKS[task],
+        "obstacles": OBSTACLES[obstacles],
+        "action": replace(ACTIONS[action], finger_step=0.04 if grasps else None),
+        "max_episode_steps": _TIME_LIMITS[task],
+    }

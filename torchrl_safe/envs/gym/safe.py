@@ -1,0 +1,278 @@
+"""Gymnasium environments with their cost beside the reward.
+
+Import from :mod:`torchrl_safe.envs.gym`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data.utils import torch_to_numpy_dtype_dict
+from torchrl.envs import EnvBase, GymEnv, GymWrapper
+from torchrl.envs.gym_like import BaseInfoDictReader
+from torchrl.envs.libs.gym import terminal_obs_reader
+
+from torchrl_safe._checks import check_array
+from torchrl_safe.envs.gym import autoreset, safety_gymnasium
+
+
+class _CostBesideReward(GymWrapper):
+    """What :class:`SafeGymWrapper` and :class:`SafeGymEnv` add to TorchRL's classes."""
+
+    def __init__(
+        self, *args: Any, cost_keys: Sequence[NestedKey] = ("cost",), **kwargs: Any
+    ) -> None:
+        if isinstance(cost_keys, str) or not cost_keys:
+            raise ValueError(
+                f"cost_keys must be a sequence of at least one key, got {cost_keys!r}."
+            )
+        keys = [unravel_key(key) for key in cost_keys]
+        self._cost_paths = [(key,) if isinstance(key, str) else key for key in keys]
+        super().__init__(*args, **kwargs)
+
+    @property
+    def reward_key(self) -> str:
+        """Key of the reward alone: TorchRL's own code writes the reward there."""
+        return "reward"
+
+    def _make_specs(self, env: gymnasium.Env) -> None:
+        super()._make_specs(env)
+        # For _step: asking an environment for its specs takes longer than encoding a value.
+        box = isinstance(self.action_spec, Bounded | Unbounded) and self._convert_actions_to_numpy
+        self._box_action_key = self.action_key if box else None
+        self._one_observation = next(iter(self.observation_spec.items(True, True)))
+        reward = self.full_reward_spec["reward"]
+        self._one_reward = reward
+        self._flag_shape = (*self.batch_size, 1)
+        self.reward_spec = Composite(
+            reward=reward,
+            cost=Unbounded(
+                (*self.batch_size, len(self._cost_paths)), dtype=torch.float32, device=self.device
+            ),
+            shape=self.batch_size,
+        )
+        self._cost = np.zeros(self.full_reward_spec["cost"].shape)
+        # Which environments have reset themselves in the last step, and all their observations.
+        self._started: tuple[NDArray[np.bool_], Any] | None = None
+        self._vectorized = self._is_batched
+        self._resets_itself = self._vectorized and autoreset.resets_itself(self._env)
+
+    def read_reward(self, reward: Any) -> Tensor:
+        return _encode(self._one_reward, reward)
+
+    def read_obs(self, observations: Any) -> dict[str, Any]:
+        if isinstance(observations, Mapping):
+            return super().read_obs(observations)
+        key, spec = self._one_observation
+        return {key: _encode(spec, observations)}
+
+    def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
+        # TorchRL 0.14.1 takes it for granted that a tensordict has a mask.
+        return kwargs if reset is None else super()._replace_reset(reset, kwargs)
+
+    def auto_register_info_dict(
+        self,
+        ignore_private: bool = True,
+        *,
+        info_dict_reader: BaseInfoDictReader | None = None,
+    ) -> EnvBase:
+        # Where environments reset themselves, TorchRL registers this reader to find the last
+        # observations. It also makes an observation of every entry of info, fails on nested ones,
+        # lets a full reset return observations of the episode before, and finds nothing under the
+        # names of Gymnasium 0.28: NaN then. Here _output_transform finds them.
+        if isinstance(info_dict_reader, terminal_obs_reader):
+            return self
+        return super().auto_register_info_dict(ignore_private, info_dict_reader=info_dict_reader)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        started, self._started = self._started, None
+        if started is not None and mask is not None and not kwargs:
+            done, observation = started
+            if np.array_equal(mask.numpy(force=True).reshape(done.shape), done):
+                source = self.read_obs(observation)
+                return TensorDict(source, self.batch_size, device=self.device)
+        if not self._resets_itself or mask is None or mask.all():
+            return super()._reset(tensordict, **kwargs)
+        raise RuntimeError(
+            "They reset themselves: only environments that are done can be reset apart from the "
+            "others."
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._action_of(tensordict)
+        reward: Any = 0
+        self._cost.fill(0)  # _output_transform adds to it.
+        for _ in range(self.wrapper_frame_skip):
+            outcome = self._output_transform(self._env.step(action))
+            observation, frame_reward, terminated, truncated, done, info = outcome
+            reward = reward + frame_reward
+            if done.any() if self._vectorized else done:
+                break
+        source = self.read_obs(observation)
+        source["reward"] = self.read_reward(reward)
+        source["cost"] = torch.from_numpy(self._cost.astype(np.float32))
+        for name, flag in (("terminated", terminated), ("truncated", truncated), ("done", done)):
+            source[name] = torch.from_numpy(np.array(flag, np.bool_).reshape(self._flag_shape))
+        after = TensorDict(source, self.batch_size)
+        if self.device is not None:
+            after = after.to(self.device)
+        if self._resets_itself:
+            # Tells TorchRL's VecGymEnvTransform that nothing is left to be replaced.
+            after["final"] = TensorDict(batch_size=self.batch_size)
+        for reader in self.info_dict_reader:
+            read = reader(info, after)
+            after = after if read is None else read
+        return after
+
+    def _action_of(self, tensordict: TensorDictBase) -> Any:
+        if self._box_action_key is not None:
+            return tensordict.get(self._box_action_key).detach().cpu().numpy()
+        keys = self.action_keys
+        action = tensordict[keys[0]] if len(keys) == 1 else tensordict.select(*keys).to_dict()
+        return self.read_action(action) if self._convert_actions_to_numpy else action
+
+    def _output_transform(self, step_outputs_tuple: tuple) -> tuple:
+        # Safety-Gymnasium returns the cost between the reward and the flags.
+        observation, reward, *cost, terminated, truncated, info = step_outputs_tuple
+        done = terminated | truncated
+        self._started = None
+        if self._resets_itself and done.any():
+            self._started = done, observation
+            observation = autoreset.last_observation(self._env, observation, info, done)
+            info = autoreset.last_info(info, done)
+        for column, path in enumerate(self._cost_paths):
+            own = cost and path == ("cost",)
+            value = cost[0] if own else _look_up(info, path)
+            self._cost[..., column] += self._checked(path, value)
+        return observation, reward, terminated, truncated, done, info
+
+    def _checked(self, path: tuple[str, ...], value: Any) -> Any:
+        # What a single environment nearly always returns is told from the rest without an array.
+        if type(value) is float and not self._vectorized and abs(value) <= 1:
+            return value
+        return check_array(f"cost {'.'.join(path)!r}", value, self._cost.shape[:-1])
+
+
+def _encode(spec: TensorSpec, value: Any) -> Tensor:
+    """The tensor for a value; numbers by a copy, which is faster than ``spec.encode``."""
+    if not isinstance(spec, Bounded | Unbounded):
+        return spec.encode(value, ignore_device=True)
+    dtype = torch_to_numpy_dtype_dict[spec.dtype]
+    return torch.from_numpy(np.array(value, dtype).reshape(spec.shape))
+
+
+def _look_up(info: Any, path: tuple[str, ...]) -> Any:
+    """The entry of an info; raises unless every environment has it."""
+    entry, present = info, True
+    for name in path:
+        known = autoreset.entries(entry)
+        if name not in known:
+            raise KeyError(f"info must have {path} in every step, got only {[*info]}.")
+        entry, present = known[name], known.get(f"_{name}", True)
+    # Gymnasium's mask of the environments that have the entry, if the info is of several.
+    if isinstance(present, np.ndarray) and not present.all():
+        rows = np.flatnonzero(~present).tolist()
+        raise KeyError(f"info must have {path} in every step, environments {rows} have none.")
+    return entry
+
+
+class SafeGymWrapper(_CostBesideReward):
+    """TorchRL's :class:`~torchrl.envs.GymWrapper` for environments that report costs.
+
+    ``cost`` of shape ``(*batch, k)``, float32, stands in the reward spec beside ``reward``. It is
+    read from the info of ``step``, or, for the name ``"cost"``, from its third output where there
+    are six, as in Safety-Gymnasium. ``reset`` returns none.
+
+    Vectorized environments may reset in the modes that TorchRL supports, ``DISABLED`` and
+    ``SAME_STEP``; the last observation, reward and cost of an episode are the true ones in both,
+    and in the vectorized environments of Gymnasium 0.28 and Safety-Gymnasium, which know no modes.
+    Gymnasium gives an entry of a vectorized info the type it has in the first environment: a cost
+    must be a float everywhere, or its fractions are lost.
+
+    Args:
+        env (gymnasium.Env or gymnasium.vector.VectorEnv): the environment.
+
+    Keyword Args:
+        cost_keys (Sequence[NestedKey], optional): the entries of ``info`` that are costs, k keys
+            for k columns; a tuple names an entry of an entry. Defaults to ``("cost",)``.
+        **kwargs: arguments of :class:`~torchrl.envs.GymWrapper`.
+
+    Raises:
+        ValueError: if ``cost_keys`` is empty, or a cost is not a finite number.
+        KeyError: if a step does not report a cost.
+
+    Examples:
+        >>> from torchrl_safe.envs.gym import ArmGymEnv
+        >>> env = SafeGymWrapper(ArmGymEnv(), cost_keys=["cost", ("costs", "collision")])
+        >>> env.rollout(3)["next", "cost"].shape
+        torch.Size([3, 2])
+        >>> env.close()
+    """
+
+    def __init__(self, env: Any = None, **kwargs: Any) -> None:
+        super().__init__(env=env, **kwargs)
+
+
+class SafeGymEnv(_CostBesideReward, GymEnv):
+    """TorchRL's :class:`~torchrl.envs.GymEnv` for environments that report costs.
+
+    As :class:`SafeGymWrapper`, with the name of a registered environment.
+
+    Args:
+        env_name (str): name in Gymnasium's registry, or of Safety-Gymnasium, which is imported
+            for it: ``"SafetyPointGoal1-v0"``, ``"SafetyPointGoal1Gymnasium-v0"``.
+
+    Keyword Args:
+        cost_keys (Sequence[NestedKey], optional): the entries of ``info`` that are costs.
+            Defaults to ``("cost",)``.
+        num_envs (int, optional): number of processes with an environment each. Defaults to ``0``:
+            one environment in this process, without a batch dimension. TorchRL's ``num_workers``
+            acts on its own ``GymEnv`` only; :class:`~torchrl.envs.ParallelEnv` does the same.
+        **kwargs: arguments of :class:`~torchrl.envs.GymEnv` and of the environment.
+
+    Examples:
+        >>> env = SafeGymEnv("torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0")
+        >>> rollout = env.rollout(3)
+        >>> rollout["next", "reward"].shape, rollout["next", "cost"].shape
+        (torch.Size([3, 1]), torch.Size([3, 1]))
+        >>> env.close()
+    """
+
+    def __init__(self, env_name: str, **kwargs: Any) -> None:
+        super().__init__(env_name, **{"backend": "gymnasium", **kwargs})
+
+    @property
+    def lib(self) -> Any:
+        # All that TorchRL 0.14.1 takes from it is `make`.
+        return SimpleNamespace(make=partial(_make, self._maker.make))
+
+    def _build_env(self, env_name: str, **kwargs: Any) -> Any:
+        self._maker, name = safety_gymnasium.find_maker(env_name)
+        return super()._build_env(name, **kwargs)
+
+    def _async_env(self, factories: Sequence[Callable[[], gymnasium.Env]]) -> Any:
+        if self._maker is gymnasium:
+            return autoreset.async_vector_env(factories)
+        return safety_gymnasium.async_vector_env(factories)
+
+
+def _make(make: Callable[..., gymnasium.Env], env_name: str, **kwargs: Any) -> gymnasium.Env:
+    try:
+        return make(env_name, **kwargs)
+    except TypeError as error:
+        # TorchRL tries an argument of this name, and then without it if the error says so. A class
+        # without a constructor of its own says only that it takes none.
+        if "frameskip" in kwargs and "takes no arguments" in str(error):
+            raise TypeError("unexpected keyword argument 'frameskip'") from error
+        raise

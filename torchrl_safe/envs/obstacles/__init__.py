@@ -1,0 +1,32 @@
+"""Obstacles: their shapes, where they stand and how they move."""
+
+from torchrl_safe.envs.obstacles.human import Human
+from torchrl_safe.envs.obstacles.layouts import (
+    InFront,
+    NoObstacles,
+    Obstacles,
+    Path,
+    Placement,
+    Scattered,
+)
+from torchrl_safe.envs.obstacles.moving import Motion, Moving, Patrol, Swing
+from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sphere
+
+__all__ = [
+    "Box",
+    "Capsule",
+    "Cylinder",
+    "Human",
+    "InFront",
+    "Motion",
+    "Moving",
+    "NoObstacles",
+    "Obstacles",
+    "Path",
+    "Patrol",
+    "Placement",
+    "Scattered",
+    "Shape",
+    "Sphere",
+    "Swing",
+]

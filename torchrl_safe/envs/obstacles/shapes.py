@@ -1,0 +1,143 @@
+"""Shapes of obstacles and of the objects that tasks move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_safe._checks import check_array, check_not_negative, check_positive
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder along its z axis.
+
+    Args:
+        radius: m.
+        height: m.
+        mass: kg; 0 fixes it in place, anything else can be pushed and knocked over.
+
+    Raises:
+        ValueError: if a size is not positive or the mass is negative.
+
+    Examples:
+        >>> Cylinder(radius=0.04, height=0.3).half_extents
+        (0.04, 0.04, 0.15)
+    """
+
+    radius: float = 0.05
+    height: float = 0.2
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive(radius=self.radius, height=self.height)
+        check_not_negative(mass=self.mass)
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """Half of the size along the shape's own x, y and z axes, m."""
+        return (self.radius, self.radius, self.height / 2)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cuboid.
+
+    Args:
+        half_extents: half of the size along its own x, y and z axes, m.
+        mass: kg; 0 fixes it in place.
+
+    Raises:
+        ValueError: if a size is not positive or the mass is negative.
+
+    Examples:
+        >>> Box(half_extents=(0.02, 0.02, 0.02), mass=1.0).mass
+        1.0
+    """
+
+    half_extents: tuple[float, float, float] = (0.05, 0.05, 0.1)
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (check_array("half_extents", self.half_extents, (3,)) > 0).all():
+            raise ValueError(f"half_extents must be positive, got {self.half_extents}.")
+        check_not_negative(mass=self.mass)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball.
+
+    Args:
+        radius: m.
+        mass: kg; 0 fixes it in place.
+
+    Raises:
+        ValueError: if the radius is not positive or the mass is negative.
+
+    Examples:
+        >>> Sphere(0.1).half_extents
+        (0.1, 0.1, 0.1)
+    """
+
+    radius: float = 0.08
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive(radius=self.radius)
+        check_not_negative(mass=self.mass)
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """Half of the size along the shape's own x, y and z axes, m."""
+        return (self.radius,) * 3
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A cylinder along its z axis with a half ball at each end.
+
+    Args:
+        radius: m.
+        length: distance between the centres of the half balls, m.
+        mass: kg; 0 fixes it in place.
+
+    Raises:
+        ValueError: if a size is not positive or the mass is negative.
+
+    Examples:
+        >>> Capsule(radius=0.05, length=0.3).half_extents
+        (0.05, 0.05, 0.2)
+    """
+
+    radius: float = 0.05
+    length: float = 0.1
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive(radius=self.radius, length=self.length)
+        check_not_negative(mass=self.mass)
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """Half of the size along the shape's own x, y and z axes, m."""
+        return (self.radius, self.radius, self.length / 2 + self.radius)
+
+
+#: What an obstacle or an object can look like.
+Shape = Cylinder | Box | Sphere | Capsule
+
+
+def footprint(shape: Shape) -> float:
+    """Returns the radius of the circle around an upright shape seen from above, m.
+
+    Examples:
+        >>> footprint(Box((0.03, 0.04, 0.1)))
+        0.05
+    """
+    match shape:
+        case Box():
+            return float(np.hypot(*shape.half_extents[:2]))
+        case Cylinder() | Sphere() | Capsule():
+            return shape.radius

@@ -1,0 +1,1 @@
+"""Physics engines behind one protocol: see :mod:`torchrl_safe.envs.physics.simulator`."""

@@ -1,0 +1,217 @@
+"""Loads arms, shapes and furniture into a PyBullet server."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.arms.urdf import prepare_urdf
+from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from torchrl_safe.envs.physics.bullet.engine import pybullet, pybullet_data
+from torchrl_safe.envs.physics.scene import Scene
+from torchrl_safe.envs.state import Array
+
+_WOOD = (0.72, 0.58, 0.42, 1.0)
+_UNLIMITED_EFFORT = 1e5
+# More than the fingers' motors can do, N.
+_GEAR_FORCE = 1e3
+
+
+@dataclass(frozen=True)
+class LoadedArm:
+    """What PyBullet calls an arm's parts, and what its URDF says of them.
+
+    Attributes:
+        body: number of the body.
+        ee: number of the tool link.
+        base: numbers of the links that no joint moves, -1 among them.
+        joints: numbers of the arm's joints, from base to tool.
+        fingers: numbers of the other movable joints.
+        columns: where the arm's joints are among all movable joints, of which Bullet's Jacobian
+            and inverse kinematics speak.
+        num_movable: number of all movable joints.
+        joint_lower: lower limits of the arm's joints, rad.
+        joint_upper: upper limits of the arm's joints, rad.
+        speed: largest speeds of joints and fingers, rad/s and m/s.
+        effort: largest torques and forces of joints and fingers, N m and N.
+    """
+
+    body: int
+    ee: int
+    base: frozenset[int]
+    joints: list[int]
+    fingers: list[int]
+    columns: list[int]
+    num_movable: int
+    joint_lower: Array
+    joint_upper: Array
+    speed: Array
+    effort: list[float]
+
+
+def load_arm(
+    client: int,
+    arm: ArmModel,
+    scene: Scene,
+    *,
+    visuals: bool,
+    merge: bool,
+    urdf_inertia: bool,
+    self_collision: bool,
+) -> LoadedArm:
+    """Loads an arm whose fingers are fixed unless the scene leaves them free.
+
+    Raises:
+        ValueError: if the URDF does not load or the home pose does not fit it.
+    """
+    text, chain, tool_link = prepare_urdf(
+        arm, visuals=visuals, fix_fingers=not scene.free_fingers, merge=merge
+    )
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE if urdf_inertia else 0
+    if self_collision:
+        flags |= pybullet.URDF_USE_SELF_COLLISION
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "arm.urdf"
+        file.write_text(text)
+        try:
+            body = pybullet.loadURDF(
+                str(file), useFixedBase=True, flags=flags, physicsClientId=client
+            )
+        except pybullet.error as error:
+            raise ValueError(f"urdf {arm.urdf!r} does not load in PyBullet.") from error
+    loaded = _find_joints(client, body, chain, tool_link)
+    if len(arm.home) != len(loaded.joints):
+        raise ValueError(
+            f"home must give {len(loaded.joints)} joint angles, one for each movable joint up to "
+            f"{arm.ee_link!r}, got {len(arm.home)}."
+        )
+    if not np.all((loaded.joint_lower <= arm.home) & (arm.home <= loaded.joint_upper)):
+        raise ValueError(
+            f"home must be within the joint limits {loaded.joint_lower.tolist()} and "
+            f"{loaded.joint_upper.tolist()}, got {arm.home}."
+        )
+    if scene.motor_limits:
+        _couple(client, body, loaded.fingers)
+    return loaded
+
+
+def _couple(client: int, body: int, fingers: Sequence[int]) -> None:
+    """Makes the fingers open alike, as the gear of a parallel gripper does.
+
+    Else equal efforts from both sides of what is held cancel, and it slides with both fingers
+    towards either of them as soon as the hand moves.
+    """
+    for finger in fingers[1:]:
+        gear = pybullet.createConstraint(
+            body,
+            fingers[0],
+            body,
+            finger,
+            jointType=pybullet.JOINT_GEAR,
+            jointAxis=(1, 0, 0),
+            parentFramePosition=(0, 0, 0),
+            childFramePosition=(0, 0, 0),
+            physicsClientId=client,
+        )
+        pybullet.changeConstraint(
+            gear, gearRatio=-1, erp=0.1, maxForce=_GEAR_FORCE, physicsClientId=client
+        )
+
+
+def _find_joints(client: int, body: int, chain: set[str], tool_link: str) -> LoadedArm:
+    """Sorts the joints into those of the arm and free fingers, and reads their limits."""
+    infos = [
+        pybullet.getJointInfo(body, joint, physicsClientId=client)
+        for joint in range(pybullet.getNumJoints(body, physicsClientId=client))
+    ]
+    movable = [info for info in infos if info[2] != pybullet.JOINT_FIXED]
+    base = {-1}
+    # Parents come before their children.
+    for info in infos:
+        if info[2] == pybullet.JOINT_FIXED and info[16] in base:
+            base.add(info[0])
+    joints = [info for info in movable if info[1].decode() in chain]
+    if not joints:
+        raise ValueError(f"ee_link must be a link that a joint moves, got {tool_link!r}.")
+    fingers = [info for info in movable if info[1].decode() not in chain]
+    unlimited = [info[8] >= info[9] for info in joints]
+    return LoadedArm(
+        body=body,
+        ee=next(info[0] for info in infos if info[12].decode() == tool_link),
+        base=frozenset(base),
+        joints=[info[0] for info in joints],
+        fingers=[info[0] for info in fingers],
+        columns=[movable.index(info) for info in joints],
+        num_movable=len(movable),
+        joint_lower=np.where(unlimited, -np.inf, [info[8] for info in joints]),
+        joint_upper=np.where(unlimited, np.inf, [info[9] for info in joints]),
+        speed=np.array([info[11] or np.inf for info in joints + fingers]),
+        effort=[info[10] or _UNLIMITED_EFFORT for info in joints + fingers],
+    )
+
+
+def load_furniture(
+    client: int, furniture: Sequence[tuple[str, Sequence[float]]], *, visuals: bool
+) -> list[int]:
+    """Loads URDF files of ``pybullet_data``, or if there are none a table with top at height 0."""
+    if furniture:
+        return [
+            pybullet.loadURDF(_data(urdf), position, useFixedBase=True, physicsClientId=client)
+            for urdf, position in furniture
+        ]
+    table = Box(half_extents=(0.75, 0.6, 0.025))
+    body = add_shape(client, table, (0.5, 0, -0.025), _WOOD if visuals else None)
+    if visuals:
+        pybullet.loadURDF(_data("plane.urdf"), (0, 0, -0.7), physicsClientId=client)
+    return [body]
+
+
+def load_body(client: int, urdf: str, position: Sequence[float]) -> int:
+    """Loads a URDF file of ``pybullet_data`` that is free to move."""
+    return pybullet.loadURDF(_data(urdf), position, physicsClientId=client)
+
+
+def add_shape(
+    client: int, shape: Shape, position: Sequence[float], colour: Sequence[float] | None
+) -> int:
+    """Adds a shape; without a colour it is simulated but not drawn."""
+    geometry, size = _geometry(shape)
+    body = pybullet.createCollisionShape(geometry, physicsClientId=client, **size)
+    skin = -1
+    if colour is not None:
+        # PyBullet calls the same measure "height" of a shape and "length" of its skin.
+        size = {"length" if name == "height" else name: value for name, value in size.items()}
+        skin = pybullet.createVisualShape(
+            geometry, rgbaColor=colour, physicsClientId=client, **size
+        )
+    return pybullet.createMultiBody(shape.mass, body, skin, position, physicsClientId=client)
+
+
+def add_marker(client: int, position: Sequence[float], colour: Sequence[float]) -> int:
+    """Adds a small ball that is drawn but not simulated."""
+    skin = pybullet.createVisualShape(
+        pybullet.GEOM_SPHERE, radius=0.02, rgbaColor=colour, physicsClientId=client
+    )
+    return pybullet.createMultiBody(0, -1, skin, position, physicsClientId=client)
+
+
+def _geometry(shape: Shape) -> tuple[int, dict[str, Any]]:
+    match shape:
+        case Cylinder():
+            return pybullet.GEOM_CYLINDER, {"radius": shape.radius, "height": shape.height}
+        case Box():
+            return pybullet.GEOM_BOX, {"halfExtents": shape.half_extents}
+        case Sphere():
+            return pybullet.GEOM_SPHERE, {"radius": shape.radius}
+        case Capsule():
+            return pybullet.GEOM_CAPSULE, {"radius": shape.radius, "height": shape.length}
+
+
+def _data(urdf: str) -> str:
+    return str(Path(pybullet_data.getDataPath(), urdf))

@@ -1,0 +1,5 @@
+"""MuJoCo: nothing outside this folder imports or names it."""
+
+from torchrl_safe.envs.physics.mujoco.physics import MuJoCo
+
+__all__ = ["MuJoCo"]

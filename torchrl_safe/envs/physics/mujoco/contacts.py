@@ -1,0 +1,104 @@
+"""What touches what, and how: filters, friction and stiffness of contacts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.scene import SUBSTEP
+
+# Who may touch whom: the arm, what stays where it is put, and what physics moves.
+_ARM, _FIXED, _FREE = 1, 2, 4
+#: Friction of everything whose URDF gives none. PyBullet multiplies those of the two that touch;
+#: MuJoCo takes the larger, or that of the shape with the higher priority: here the product.
+_FRICTION = 0.5
+# Against turning on the spot and rolling, m: of a fingertip, and next to none.
+_SPIN, _ROLL = 0.005, 1e-4
+#: As stiff as the step allows, and without bouncing: time constant, s, and damping ratio.
+STIFF = (2 * SUBSTEP, 1.0)
+
+
+def set_options(spec: Any, gravity: float) -> None:
+    """Chooses how the world is simulated.
+
+    The integrator sees the stiffness of motors and contacts together; with another one the fingers
+    of a gripper drop what they hold.
+    """
+    option = spec.option
+    option.timestep = SUBSTEP
+    option.gravity = (0, 0, -gravity)
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10
+    # A state that has gone wrong is to be seen, not to be replaced by another.
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+
+
+def set_arm_contacts(spec: Any, frictions: Mapping[str, float], *, itself: bool) -> None:
+    """Makes the shapes of an arm collide, with each other if wanted.
+
+    Args:
+        spec: the arm.
+        frictions: lateral friction of the links that have one of their own.
+        itself: let links collide with each other.
+    """
+    for body in spec.bodies[1:]:
+        own = frictions.get(body.name)
+        for geom in body.geoms:
+            # Shapes that are only drawn have neither.
+            if geom.contype or geom.conaffinity:
+                _set(geom, _ARM, _FIXED | _FREE | (_ARM if itself else 0))
+                if own is not None:
+                    geom.friction = (_FRICTION * own, _SPIN, _ROLL)
+                    geom.priority = 1
+    for gear in spec.equalities:
+        gear.solref = STIFF
+    for joint in spec.joints:
+        joint.solref_limit = STIFF
+
+
+def set_contacts(geom: Any, *, free: bool, reach: float) -> None:
+    """Makes the shape of an obstacle, an object or the table collide.
+
+    Args:
+        geom: the shape.
+        free: whether physics moves it.
+        reach: distance from which on contacts are found, m; forces begin at a touch.
+    """
+    _set(geom, _FREE if free else _FIXED, _ARM | _FREE | (_FIXED if free else 0))
+    geom.gap = reach
+
+
+def _set(geom: Any, kind: int, others: int) -> None:
+    geom.contype, geom.conaffinity = kind, others
+    geom.condim = 4
+    geom.friction = (_FRICTION**2, _SPIN, _ROLL)
+    geom.solref = STIFF
+    geom.margin = 0.0
+
+
+def exclude_overlaps(spec: Any, arm: set[str], model: Any, data: Any) -> None:
+    """Keeps those links from colliding that touch each other at home, and neighbours.
+
+    The collision shapes of neighbours overlap, which is not the arm's doing. MuJoCo does not test
+    parents against children, unless the parent does not move.
+
+    Args:
+        spec: the world; changed in place.
+        arm: names of the arm's bodies.
+        model: the world as it is, compiled.
+        data: its state at home, with contacts.
+    """
+    contacts = data.contact
+    touching = np.asarray(model.geom_bodyid)[contacts.geom[contacts.dist <= 0]]
+    pairs = {tuple(sorted(model.body(i).name for i in pair)) for pair in touching}
+    for body in arm:
+        parent = model.body(model.body(body).parentid[0]).name
+        pairs.add(tuple(sorted((body, parent))))
+    for one, other in combinations(sorted(arm), 2):
+        if (one, other) in pairs:
+            spec.add_exclude(bodyname1=one, bodyname2=other)

@@ -1,0 +1,138 @@
+"""Puts arm, table, obstacles, objects, motors and sensors together into a compiled world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.obstacles.shapes import Shape
+from torchrl_safe.envs.physics.mujoco.arm import ArmParts, read_arm
+from torchrl_safe.envs.physics.mujoco.bodies import add_object, add_obstacle, add_table
+from torchrl_safe.envs.physics.mujoco.contacts import exclude_overlaps, set_options
+from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.mujoco.inertia import set_box_inertias
+from torchrl_safe.envs.physics.mujoco.motors import add_motors, set_gains
+from torchrl_safe.envs.physics.mujoco.readings import CONTACT_RANGE, Place, Sensors
+from torchrl_safe.envs.physics.mujoco.scenery import add_scenery, dress_arm
+from torchrl_safe.envs.physics.scene import Scene
+from torchrl_safe.envs.state import Array, Sensing
+
+
+@dataclass(frozen=True)
+class World:
+    """A compiled world, and where its parts are.
+
+    Attributes:
+        model: the ``MjModel``.
+        parts: names and limits of the arm.
+        places: where the readings of each kind are in the sensor data.
+        position: where arm joints and free fingers are in ``qpos``, ``(n + f,)``.
+        velocity: where they are in ``qvel``, ``(n + f,)``.
+        home: ``qpos`` with the arm at home.
+    """
+
+    model: Any
+    parts: ArmParts
+    places: dict[str, Place]
+    position: Array
+    velocity: Array
+    home: Array
+
+
+def build_world(
+    arm: ArmModel,
+    scene: Scene,
+    shapes: Sequence[Shape],
+    objects: Sequence[Shape],
+    sensing: Sensing,
+) -> World:
+    """Builds the world of an environment.
+
+    Raises:
+        ValueError: if the URDF does not load or the home pose does not fit it.
+    """
+    spec, parts = _read_arm(arm, scene, objects, itself=sensing.itself)
+    links = {body.name for body in spec.bodies[1:]}
+    try:
+        set_box_inertias(spec)
+    except ValueError as error:
+        raise ValueError(f"urdf {arm.urdf!r} does not load in MuJoCo: {error}") from error
+    set_options(spec, scene.gravity)
+    _add_bodies(spec, shapes, objects, reach=max(CONTACT_RANGE, sensing.clearance))
+    add_motors(spec, parts, limited=scene.motor_limits)
+    sensors = Sensors(spec, parts, shapes, sensing)
+    model, data = _at_home(spec, arm, parts)
+    exclude_overlaps(spec, links, model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    model = spec.compile()
+    ids = [model.joint(name).id for name in parts.joints + parts.fingers]
+    velocity = model.jnt_dofadr[ids]
+    set_gains(model, np.diag(mass)[velocity])
+    return World(
+        model=model,
+        parts=parts,
+        places=sensors.places,
+        position=model.jnt_qposadr[ids],
+        velocity=velocity,
+        home=data.qpos.copy(),
+    )
+
+
+def build_scenery(
+    arm: ArmModel, scene: Scene, shapes: Sequence[Shape], objects: Sequence[Shape]
+) -> Any:
+    """Builds what is to be seen of a world: an ``MjModel`` with the same joints.
+
+    Of what is put in its places from outside, the goal is the last.
+    """
+    spec, _ = _read_arm(arm, scene, objects, visuals=True)
+    dress_arm(spec)
+    _add_bodies(spec, shapes, objects, reach=0.0)
+    add_scenery(spec)
+    return spec.compile()
+
+
+def _read_arm(
+    arm: ArmModel,
+    scene: Scene,
+    objects: Sequence[Shape],
+    *,
+    visuals: bool = False,
+    itself: bool = False,
+) -> tuple[Any, ArmParts]:
+    return read_arm(
+        arm,
+        fix_fingers=not scene.free_fingers,
+        # What touches objects has friction of its own, link by link.
+        merge=not objects,
+        couple=scene.motor_limits,
+        visuals=visuals,
+        itself=itself,
+    )
+
+
+def _add_bodies(
+    spec: Any, shapes: Sequence[Shape], objects: Sequence[Shape], *, reach: float
+) -> None:
+    add_table(spec, reach=CONTACT_RANGE)
+    for index, shape in enumerate(shapes):
+        add_obstacle(spec, index, shape, reach=reach)
+    for index, shape in enumerate(objects):
+        add_object(spec, index, shape)
+
+
+def _at_home(spec: Any, arm: ArmModel, parts: ArmParts) -> tuple[Any, Any]:
+    """The world compiled as it is, and its state with the arm at home and all else far away."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for name, angle in zip(parts.joints, arm.home, strict=True):
+        data.joint(name).qpos = angle
+    for name in parts.fingers:
+        data.joint(name).qpos = arm.finger_home
+    mujoco.mj_forward(model, data)
+    return model, data

@@ -1,0 +1,88 @@
+"""Motors that do within a control step what an action asks for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from torchrl_safe.envs.physics.mujoco.arm import ArmParts
+from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.scene import SUBSTEP
+from torchrl_safe.envs.state import Array
+
+# How fast the motors of the joints correct, rad/s. Their damping then stops a joint within one
+# substep; with more, motors at the end of their efforts, which MuJoCo does not treat implicitly,
+# would chatter.
+_RATE = 0.5 / SUBSTEP
+# Fingers press with all their effort what keeps them this far from where they are to be, m.
+_SQUEEZE = 0.005
+# The effort of fingers that have no limit, N.
+_FINGER_EFFORT = 20.0
+#: The group of the fingers' motors, which rest where an action moves no fingers.
+FINGER_GROUP = 1
+
+
+def add_motors(spec: Any, parts: ArmParts, *, limited: bool) -> None:
+    """Adds a position and a velocity servo to each joint: first all positions, then velocities.
+
+    Args:
+        spec: the world; changed in place.
+        parts: of the arm.
+        limited: keep the two of a joint together within its effort.
+    """
+    names = parts.joints + parts.fingers
+    for kind in ("position", "velocity"):
+        for name in names:
+            motor = spec.add_actuator(
+                name=f"{name}/{kind}", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+            )
+            motor.group = FINGER_GROUP if name in parts.fingers else 0
+            # The gains follow when the masses are known.
+            if kind == "position":
+                motor.set_to_position(kp=1.0, kv=0.0)
+            else:
+                motor.set_to_velocity(kv=1.0)
+    for name, effort in zip(names, parts.effort.tolist(), strict=True):
+        joint = spec.joint(name)
+        if limited and np.isfinite(effort):
+            joint.actfrclimited, joint.actfrcrange = True, (-effort, effort)
+        if name in parts.fingers:
+            # What is as stiff as that at the rate of the others: as if the motor had a gear.
+            strength = effort if np.isfinite(effort) else _FINGER_EFFORT
+            joint.armature = strength / _SQUEEZE / _RATE**2
+
+
+def set_gains(model: Any, mass: Array) -> None:
+    """Makes the servos of each joint critically damped for what it has to move at home.
+
+    Args:
+        model: the compiled world; changed in place.
+        mass: the diagonal of the mass matrix for joints and fingers, kg m^2 and kg.
+    """
+    count, stiffness, damping = len(mass), mass * _RATE**2, 2 * mass * _RATE
+    position, velocity = slice(0, count), slice(count, 2 * count)
+    model.actuator_gainprm[position, 0] = stiffness
+    model.actuator_biasprm[position, 1] = -stiffness
+    model.actuator_gainprm[velocity, 0] = damping
+    model.actuator_biasprm[velocity, 2] = -damping
+
+
+def fill_controls(controls: Array, current: Array, targets: Array) -> None:
+    """Writes the controls of a control step: targets that move evenly over the substeps.
+
+    With 12 substeps the joints then do what is asked for to within one percent, where efforts
+    allow. They lag by two substeps: of a control step of six they do 0.96, of a single one about
+    0.6, and the rest in the next.
+
+    Args:
+        controls: what is written, ``(N, s, 2 k)``.
+        current: where joints and fingers are, ``(N, k)``.
+        targets: where they are to be after the last substep, ``(N, k)``.
+    """
+    substeps, count = controls.shape[1], current.shape[1]
+    change = targets - current
+    share = np.arange(1, substeps + 1)[:, None] / substeps
+    np.multiply(change[:, None], share, out=controls[:, :, :count])
+    controls[:, :, :count] += current[:, None]
+    controls[:, :, count:] = (change / (substeps * SUBSTEP))[:, None]

@@ -1,0 +1,179 @@
+"""The sensors that measure what an ArmState has, for all worlds at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_safe.envs.obstacles.shapes import Shape
+from torchrl_safe.envs.physics.mujoco.arm import ArmParts
+from torchrl_safe.envs.physics.mujoco.bodies import TABLE, obstacle
+from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.mujoco.vectors import cross
+from torchrl_safe.envs.physics.paths import Ways
+from torchrl_safe.envs.state import Array, Sensing
+
+#: Distance from which on contacts are reported, m, as PyBullet does.
+CONTACT_RANGE = 0.02
+# Of one obstacle; of more contacts at once the shallowest are not counted.
+_SLOTS = 16
+_NEAREST = 1  # How a contact sensor sorts what it has found.
+# What is where in the readings of contacts; the force is in the frame of the contact.
+_FOUND, _NORMAL_FORCE, _DIST = 0, 1, 4
+
+
+class Place(NamedTuple):
+    """Where readings of one kind are in a row of sensor data."""
+
+    #: Their numbers in the row.
+    columns: slice
+    #: Their shape.
+    shape: tuple[int, ...]
+
+    def of(self, data: Array) -> Array:
+        """Cuts them out of rows ``(..., width)``; a view."""
+        return data[..., self.columns].reshape(*data.shape[:-1], *self.shape)
+
+
+class Sensors:
+    """Adds the sensors to a world, and knows where each is in what they read.
+
+    Args:
+        spec: the world; changed in place.
+        parts: of the arm.
+        shapes: the obstacles.
+        sensing: what is measured in every substep besides contacts.
+    """
+
+    def __init__(
+        self,
+        spec: Any,
+        parts: ArmParts,
+        shapes: Sequence[Shape],
+        sensing: Sensing,
+    ) -> None:
+        self._spec, self._parts = spec, parts
+        self._width = 0
+        #: Where the readings of each kind are.
+        self.places: dict[str, Place] = {}
+        frame = mujoco.mjtObj.mjOBJ_XBODY
+        self._add_contacts("contacts", shapes, slots=_SLOTS, data=("FOUND", "FORCE", "DIST"))
+        if sensing.clearance:
+            data = ("FOUND", "DIST", "POS", "NORMAL", "LINVEL")
+            self._add_contacts("nearest", shapes, slots=1, data=data, base=True)
+        if sensing.table:
+            self._add_touch("table_distance", parts.moving, mujoco.mjtObj.mjOBJ_GEOM, TABLE)
+        if sensing.itself:
+            self._add_touch("self_distance", parts.root, frame, parts.root)
+        if sensing.tool:
+            self._add("ee_position", mujoco.mjtSensor.mjSENS_FRAMEPOS, frame, parts.tool)
+            self._add("ee_velocity", mujoco.mjtSensor.mjSENS_FRAMELINVEL, frame, parts.tool)
+        if sensing.links:
+            # Of a body MuJoCo tells the velocity of its centre of mass.
+            kind, body = mujoco.mjtSensor.mjSENS_FRAMELINVEL, mujoco.mjtObj.mjOBJ_BODY
+            for link in parts.links:
+                spec.add_sensor(type=kind, objtype=body, objname=link)
+            self._note("links", (len(parts.links), 3))
+
+    def _add(self, name: str, kind: Any, objtype: Any, objname: str) -> None:
+        self._spec.add_sensor(type=kind, objtype=objtype, objname=objname)
+        self._note(name, (3,))
+
+    def _note(self, name: str, shape: tuple[int, ...]) -> None:
+        width = math.prod(shape)
+        self.places[name] = Place(slice(self._width, self._width + width), shape)
+        self._width += width
+
+    def _add_contacts(
+        self,
+        name: str,
+        shapes: Sequence[Shape],
+        *,
+        slots: int,
+        data: Sequence[str],
+        base: bool = False,
+    ) -> None:
+        """Contacts of each obstacle with the arm, its base included on demand, or if it is free."""
+        for index, shape in enumerate(shapes):
+            arm = self._parts.root if base or shape.mass else self._parts.moving
+            self._add_contact(arm, mujoco.mjtObj.mjOBJ_GEOM, obstacle(index), slots, data)
+        width = sum(_WIDTHS[part] for part in data)
+        self._note(name, (len(shapes), slots, width))
+
+    def _add_touch(self, name: str, body: str, reftype: Any, refname: str) -> None:
+        self._add_contact(body, reftype, refname, 1, ("FOUND", "DIST"))
+        self._note(name, (2,))
+
+    def _add_contact(
+        self, body: str, reftype: Any, refname: str, slots: int, data: Sequence[str]
+    ) -> None:
+        sensor = self._spec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_XBODY,
+            objname=body,
+            reftype=reftype,
+            refname=refname,
+        )
+        bits = (int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{part}")) for part in data)
+        sensor.intprm[:3] = (sum(1 << bit for bit in bits), _NEAREST, slots)
+
+
+# Of what a contact sensor can tell, in its order.
+_WIDTHS = {"FOUND": 1, "FORCE": 3, "DIST": 1, "POS": 3, "NORMAL": 3, "LINVEL": 3}
+
+
+def touches(data: Array) -> tuple[Array, Array]:
+    """Smallest distance, m, and largest force, N, of the contacts of a control step.
+
+    Args:
+        data: readings of contacts in every substep, ``(N, s, m, slots, 5)``.
+
+    Returns:
+        For each obstacle of each world, ``(N, m)``: distances infinite without contact.
+    """
+    worlds, _, obstacles, slots, _ = data.shape
+    distance, force = np.full((worlds, obstacles), np.inf), np.zeros((worlds, obstacles))
+    # The nearest come first. What has found nothing reads zero.
+    near = (data[..., 0, _FOUND] > 0) & (data[..., 0, _DIST] <= CONTACT_RANGE)
+    row, substep, index = near.nonzero()
+    if len(row):
+        hits = data[row, substep, index]
+        used = np.arange(slots) < hits[:, :1, _FOUND]
+        np.minimum.at(distance, (row, index), hits[:, 0, _DIST])
+        forces = np.where(used, hits[:, :, _NORMAL_FORCE], 0).sum(axis=1)
+        np.maximum.at(force, (row, index), forces)
+    return distance, force
+
+
+def touch_distance(data: Array) -> Array:
+    """Smallest distance of contacts, m, infinite without one, of readings ``(..., 2)``."""
+    return np.where(data[..., 0] > 0, data[..., 1], np.inf)
+
+
+def nearest(data: Array, reach: float, ways: Ways, free: NDArray[np.bool_]) -> dict[str, Array]:
+    """Clearance, m, and the speeds at which the closest points approach each other, m/s.
+
+    Args:
+        data: readings of the nearest contact with each obstacle, ``(..., m, 1, 11)``.
+        reach: distance up to which it counts, m.
+        ways: the obstacles at the same time, ``(..., m, width)``.
+        free: which obstacles physics moves, ``(m,)``.
+    """
+    found, distance, *rest = np.split(data[..., 0, :], (1, 2, 5, 8), axis=-1)
+    point, normal, velocity = rest
+    near = (found[..., 0] > 0) & (distance[..., 0] <= reach)
+    # The normal points from the arm to the obstacle. It does not matter that the point lies
+    # between the two: along the normal all points of a body are equally fast.
+    turned = cross(ways.position - point, ways.angular_velocity)
+    obstacle = -((ways.velocity + turned) * normal).sum(axis=-1)
+    closing = -velocity[..., 0]
+    # To MuJoCo, what is put in its places from outside does not move.
+    return {
+        "clearance": np.where(near, distance[..., 0], np.inf),
+        "arm_approach": np.where(near, closing - np.where(free, obstacle, 0), 0.0),
+        "obstacle_approach": np.where(near, obstacle, 0.0),
+    }

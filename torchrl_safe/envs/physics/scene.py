@@ -1,0 +1,70 @@
+"""The world around the arm, and the camera that looks at it, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_safe._checks import check_array, check_flag, check_positive
+
+#: Duration of one physics substep, s.
+SUBSTEP = 1 / 240
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The world around the arm, whichever engine simulates it.
+
+    Args:
+        gravity: m/s^2, downwards.
+        free_fingers: leave the joints that are not part of the arm movable.
+        motor_limits: keep the motors within the efforts and speeds of the URDF.
+
+    Raises:
+        ValueError: if ``gravity`` is not finite.
+
+    Examples:
+        >>> Scene(gravity=1.62).motor_limits
+        True
+    """
+
+    gravity: float = 9.81
+    free_fingers: bool = False
+    motor_limits: bool = True
+
+    def __post_init__(self) -> None:
+        check_array("gravity", self.gravity, ())
+        check_flag(free_fingers=self.free_fingers, motor_limits=self.motor_limits)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where :meth:`~torchrl_safe.envs.ArmEnv.render` looks from.
+
+    Args:
+        eye: position of the camera, m.
+        target: the point it looks at, m.
+        field_of_view: vertical, degrees.
+
+    Raises:
+        ValueError: if a point is not three finite numbers, both are the same, or the field of view
+            is not between 0 and 180 degrees.
+
+    Examples:
+        >>> Camera(eye=(0.4, -1.5, 0.4)).field_of_view
+        45.0
+    """
+
+    eye: tuple[float, float, float] = (1.0, -1.25, 0.7)
+    target: tuple[float, float, float] = (0.3, 0.0, 0.3)
+    field_of_view: float = 45.0
+
+    def __post_init__(self) -> None:
+        if np.array_equal(
+            check_array("eye", self.eye, (3,)), check_array("target", self.target, (3,))
+        ):
+            raise ValueError(f"eye must not be where it looks, got {self.eye} for both.")
+        check_positive(field_of_view=self.field_of_view)
+        if self.field_of_view >= 180:
+            raise ValueError(f"field_of_view must be less than 180, got {self.field_of_view}.")
