@@ -612,9 +612,10 @@ def test_outputs_can_be_selected_before_torchrl_has_built_the_parent(kind):
     """TorchRL makes a property of a class's list of outputs when that class itself is built."""
     code = (
         "from off_policy import *\n"
+        "from torchrl_safe.testing import make_transitions\n"
         f"loss = make_loss({kind.__name__}, 2)\n"
         "print(*loss.select_out_keys('loss_actor', 'loss_cost_qvalue').out_keys)\n"
-        "print(*sorted(loss(make_batch(2)).keys()))"
+        "print(*sorted(loss(make_transitions(2)).keys()))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],
