@@ -156,8 +156,8 @@ class PCPO(TrustRegionMethod):
     Yang et al. 2020 (https://arxiv.org/abs/2010.03152); see
     :func:`~torchrl_safe.objectives.trust_region.solver.pcpo_weight`. Far above the limit the
     projection lies outside the trust region; the step then ends at its edge, on the way there (in
-    the paper nothing bounds it). It has one cost, for the reason given at :class:`CPO`: the projection on
-    several half-spaces has no closed form either.
+    the paper nothing bounds it). It has one cost, for the reason given at :class:`CPO`: the
+    projection on several half-spaces has no closed form either.
 
     Args:
         kl_projection (bool, optional): project to the point of least divergence, in the metric
