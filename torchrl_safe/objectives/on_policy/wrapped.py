@@ -82,6 +82,8 @@ class WrappedLoss(LossModule):
     def __setattr__(self, name: str, value: Any) -> None:
         inner = self.__dict__.get("_modules", {}).get("loss_module")
         own = name in self.__dict__ or name in self.__dict__.get("_buffers", {})
+        # What select_out_keys sets on the wrapper, and deletes from it.
+        own = own or name == "_out_keys_apparent"
         if inner is None or own or hasattr(type(self), name) or not hasattr(inner, name):
             super().__setattr__(name, value)
         else:
