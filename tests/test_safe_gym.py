@@ -124,6 +124,45 @@ def test_same_step_resets_only_what_is_done(make_env):
         env.reset(started)
 
 
+def test_environments_that_end_together_are_reset_once(make_env):
+    """They have reset themselves; a reset of a simulator may take a second."""
+    resets = []
+
+    class Resets(Counting):
+        def reset(self, **kwargs):
+            resets.append(self)
+            return super().reset(**kwargs)
+
+    env = make_env(
+        SafeGymWrapper, vector(AutoresetMode.SAME_STEP, partial(Resets, 3), partial(Resets, 3))
+    )
+    resets.clear()
+    check_counts(env.rollout(8, break_when_any_done=False), [3, 3])
+    # For the rollout, and for the two ends in it.
+    assert len(resets) == 2 * 3
+    # Asked for, a reset is one.
+    env.reset()
+    assert len(resets) == 2 * 4
+
+
+def test_an_array_that_is_used_again(make_env):
+    class Reuses(Counting):
+        def __init__(self):
+            super().__init__()
+            self.array = np.zeros(1, np.float32)
+
+        def reset(self, **kwargs):
+            self.array[:] = 0
+            return self.array, super().reset(**kwargs)[1]
+
+        def step(self, action):
+            observation, *others = super().step(action)
+            self.array[:] = observation
+            return self.array, *others
+
+    check_counts(make_env(SafeGymWrapper, Reuses()).rollout(9, break_when_any_done=False), [4])
+
+
 KEYS = [("costs", "count"), "cost", ("costs", "one")]
 
 

@@ -196,5 +196,9 @@ def _finger_targets(action: Array, state: ArmState, step: float | None) -> Array
 
 
 def _check_bound(bound: float) -> None:
-    if not isinstance(bound, Real) or not bound > 0:
+    try:
+        usable = isinstance(bound, Real) and float(bound) > 0
+    except OverflowError:  # A whole number beyond all floats.
+        usable = False
+    if not usable:
         raise ValueError(f"bound must be positive, got {bound!r}.")

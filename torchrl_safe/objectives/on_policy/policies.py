@@ -1,4 +1,4 @@
-"""What a trust-region step asks of the actor of a PPO loss."""
+"""What losses and trust-region steps ask of a policy: ratios, divergences, a copy to try."""
 
 from __future__ import annotations
 

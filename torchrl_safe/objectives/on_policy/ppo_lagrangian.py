@@ -28,7 +28,9 @@ class PPOLagrangianLoss(ConstrainedPPO, ClipPPOLoss):
       it: a :class:`~torchrl_safe.objectives.MultiplierUpdater` does, in place, once for each
       collected batch;
     - :meth:`estimate_advantages` computes both advantages for a whole batch. Call it before
-      the batch is cut into minibatches, so that a multiplier means the same in each of them.
+      the batch is cut into minibatches, so that a multiplier means the same in each of them. (A
+      call of the loss with a batch that has no advantages does the same first: the reward
+      advantage is standardized, which that of ``ClipPPOLoss`` is not.)
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): policy operator.
