@@ -64,8 +64,8 @@ def serve(config: Config) -> None:
         dist = torch.randn(size, 7), torch.ones(size, 7)
         batches[size]["loc"], batches[size]["scale"] = dist
     for line in sys.stdin:
-        name, size = line.split()
-        loss, batch = losses[name], batches[int(size)]
+        name, steps = line.split()
+        loss, batch = losses[name], batches[int(steps)]
         start = process_time()
         for _ in range(config.calls):
             outputs = loss(batch)
