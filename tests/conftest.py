@@ -4,6 +4,10 @@ import pytest
 import torch
 from worlds import turntable_settings
 
+from torchrl_safe.envs import ArmEnv, Bullet, MuJoCo
+
+ENGINES = {"bullet": Bullet(), "mujoco": MuJoCo(threads=1)}
+
 
 @pytest.fixture
 def make_env():
@@ -19,6 +23,13 @@ def make_env():
     for env in made:
         if not env.is_closed:
             env.close()
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request, monkeypatch):
+    """Its name: the engine of every ArmEnv that does not say otherwise."""
+    monkeypatch.setitem(ArmEnv.__init__.__kwdefaults__, "physics", ENGINES[request.param])
+    return request.param
 
 
 @pytest.fixture
