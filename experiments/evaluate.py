@@ -76,8 +76,8 @@ class Config:
             raise ValueError(f"video must end in .gif or .webp, got {str(self.video)!r}.")
         if self.physics is not None and self.env is not None:
             raise ValueError(
-                f"physics must not be given with env, got {self.physics} and {self.env!r}: choose it "
-                "there."
+                f"physics must not be given with env, got {self.physics!r} and {self.env!r}: "
+                "choose it there."
             )
         if self.gui and self.env is not None:
             raise ValueError(f"gui must not be given with env, got {self.env!r}: open it there.")

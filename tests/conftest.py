@@ -6,6 +6,10 @@ import pytest
 import torch
 from worlds import turntable_settings
 
+from torchrl_safe.envs import ArmEnv, Bullet, MuJoCo
+
+ENGINES = {"bullet": Bullet(), "mujoco": MuJoCo(threads=1)}
+
 
 @pytest.fixture
 def make_env():
@@ -21,6 +25,13 @@ def make_env():
     for env in made:
         if not env.is_closed:
             env.close()
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request, monkeypatch):
+    """Its name: the engine of every ArmEnv that does not say otherwise."""
+    monkeypatch.setitem(ArmEnv.__init__.__kwdefaults__, "physics", ENGINES[request.param])
+    return request.param
 
 
 @pytest.fixture

@@ -26,6 +26,8 @@ from torchrl_safe.envs import (
 )
 from torchrl_safe.envs.rotations import rotation_vector
 
+pytestmark = pytest.mark.usefixtures("engine")
+
 # An arm without a gripper.
 BARE = ArmModel("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", (0, 0.4, 0, -2, 0, 0.74, 0))
 

@@ -4,6 +4,8 @@ from worlds import each_arm, rest, turn
 
 from torchrl_safe.envs import ArmEnv, Capsule, Collision, Human, Region, Sphere
 
+pytestmark = pytest.mark.usefixtures("engine")
+
 RATE = 240
 START, GOAL = np.array([0.35, 0.0, 0.2]), np.array([0.65, 0.1, 0.1])
 PEOPLE = {

@@ -14,6 +14,8 @@ from torchrl_safe.envs import (
     paper_observation,
 )
 
+pytestmark = pytest.mark.usefixtures("engine")
+
 FIELDS = {
     "joint_position": 7,
     "joint_velocity": 7,

@@ -1,5 +1,6 @@
 """Films and the contact sheet."""
 
+import pytest
 import torch
 from PIL import Image
 from torchrl.envs import Compose, TransformedEnv
@@ -10,6 +11,8 @@ from torchrl.record.loggers import CSVLogger
 from experiments.gallery import Config, main
 from experiments.report import save_animation
 from torchrl_safe.envs import ArmEnv, Human
+
+pytestmark = pytest.mark.usefixtures("engine")
 
 
 def test_torchrl_films(make_env, tmp_path):

@@ -31,6 +31,8 @@ from torchrl_safe.envs import (
     paper_env,
 )
 
+pytestmark = pytest.mark.usefixtures("engine")
+
 ROLLING = InFront(shape=Cylinder(mass=1.0))
 ENVS = {
     "default": ArmEnv,

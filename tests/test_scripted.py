@@ -34,6 +34,8 @@ from torchrl_safe.envs import (
     Scattered,
 )
 
+pytestmark = pytest.mark.usefixtures("engine")
+
 PILOTS = {
     "reach": (over, straight),
     "push": (push_around, push_straight),

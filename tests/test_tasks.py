@@ -16,6 +16,8 @@ from torchrl_safe.envs import (
     Region,
 )
 
+pytestmark = pytest.mark.usefixtures("engine")
+
 CUBE = Box((0.02, 0.02, 0.02), mass=1.0)
 GRIP = CartesianDelta(finger_step=0.04)
 each_object_task = pytest.mark.parametrize("kind", [Push, PickAndPlace])

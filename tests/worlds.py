@@ -97,6 +97,18 @@ def step(env, action):
     return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
 
 
+def placements(env):
+    """The placement of each world's episode, by its row, from the next resets on."""
+    noted, reset = {}, env._simulator.reset
+
+    def note(row, placement, *others):
+        noted[row] = placement
+        reset(row, placement, *others)
+
+    env._simulator.reset = note
+    return noted
+
+
 def rest(env, steps=1):
     """The results of the last of some steps in which the arm is to stay where it is."""
     for _ in range(steps):

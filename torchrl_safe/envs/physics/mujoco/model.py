@@ -15,7 +15,7 @@ from torchrl_safe.envs.physics.mujoco.bodies import add_object, add_obstacle, ad
 from torchrl_safe.envs.physics.mujoco.contacts import exclude_overlaps, set_options
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.mujoco.inertia import set_box_inertias
-from torchrl_safe.envs.physics.mujoco.motors import add_motors, set_gains
+from torchrl_safe.envs.physics.mujoco.motors import add_motors, add_rotors, set_gains
 from torchrl_safe.envs.physics.mujoco.readings import CONTACT_RANGE, Place, Sensors
 from torchrl_safe.envs.physics.mujoco.scenery import add_scenery, dress_arm
 from torchrl_safe.envs.physics.scene import Scene
@@ -67,12 +67,13 @@ def build_world(
     sensors = Sensors(spec, parts, shapes, sensing)
     model, data = _at_home(spec, arm, parts)
     exclude_overlaps(spec, links, model, data)
-    mass = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, mass)
-    model = spec.compile()
     ids = [model.joint(name).id for name in parts.joints + parts.fingers]
     velocity = model.jnt_dofadr[ids]
-    set_gains(model, np.diag(mass)[velocity])
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    moved = add_rotors(spec, parts, np.diag(mass)[velocity])
+    model = spec.compile()
+    set_gains(model, moved)
     return World(
         model=model,
         parts=parts,

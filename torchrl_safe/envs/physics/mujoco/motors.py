@@ -15,6 +15,10 @@ from torchrl_safe.envs.state import Array
 # substep; with more, motors at the end of their efforts, which MuJoCo does not treat implicitly,
 # would chatter.
 _RATE = 0.5 / SUBSTEP
+# What the rotors of geared motors add to what a joint turns at home. Without it, joints with nearly
+# the same axis, such as the first and third of a stretched arm, throw each other to and fro as soon
+# as both are at the end of their efforts: against each other they have next to no inertia.
+_ROTORS = 0.5
 # Fingers press with all their effort what keeps them this far from where they are to be, m.
 _SQUEEZE = 0.005
 # The effort of fingers that have no limit, N.
@@ -44,13 +48,30 @@ def add_motors(spec: Any, parts: ArmParts, *, limited: bool) -> None:
             else:
                 motor.set_to_velocity(kv=1.0)
     for name, effort in zip(names, parts.effort.tolist(), strict=True):
-        joint = spec.joint(name)
         if limited and np.isfinite(effort):
+            joint = spec.joint(name)
             joint.actfrclimited, joint.actfrcrange = True, (-effort, effort)
-        if name in parts.fingers:
-            # What is as stiff as that at the rate of the others: as if the motor had a gear.
-            strength = effort if np.isfinite(effort) else _FINGER_EFFORT
-            joint.armature = strength / _SQUEEZE / _RATE**2
+
+
+def add_rotors(spec: Any, parts: ArmParts, mass: Array) -> Array:
+    """Adds what turns with the motors.
+
+    Args:
+        spec: the world; changed in place.
+        parts: of the arm.
+        mass: the diagonal of the mass matrix for joints and fingers at home, kg m^2 and kg.
+
+    Returns:
+        The diagonal with what was added.
+    """
+    rotors = _ROTORS * mass
+    efforts = parts.effort[len(parts.joints) :]
+    # Fingers are as heavy as makes them as stiff as that.
+    strength = np.where(np.isfinite(efforts), efforts, _FINGER_EFFORT) / _SQUEEZE
+    rotors[len(parts.joints) :] = strength / _RATE**2
+    for name, rotor in zip(parts.joints + parts.fingers, rotors.tolist(), strict=True):
+        spec.joint(name).armature = rotor
+    return mass + rotors
 
 
 def set_gains(model: Any, mass: Array) -> None:
