@@ -9,6 +9,7 @@ from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Placement
@@ -176,7 +177,7 @@ class BulletSimulator:
                 stacklevel=2,
             )
 
-    def pictures(self, camera: Camera, width: int, height: int) -> Array:
+    def pictures(self, camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
         """Returns an RGB picture of every world, uint8, ``(N, height, width, 3)``."""
         if self._picture_world is None:
             self._picture_world = World(*self._build, visuals=True)
