@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
@@ -47,8 +48,8 @@ class World:
     model: Any
     parts: ArmParts
     places: dict[str, Place]
-    position: Array
-    velocity: Array
+    position: NDArray[np.int_]
+    velocity: NDArray[np.int_]
     home: Array
 
 
