@@ -4,15 +4,18 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# Safety-Gymnasium pins an older Gymnasium and MuJoCo than ours.
+SAFETY := .venv-safety-gymnasium
+SAFETY_FILES := $(addprefix tests/with_safety_gymnasium/,requirements.txt make_importable.py)
 
 # What rounds differently from one processor to the next: losses, trust region, multipliers, metrics.
-NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_optimum cost_gae cost_q_critics \
+NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrained_optimum cost_gae cost_q_critics \
 	cost_td0 family first_order functional lagrangian metrics multipliers offpolicy_optimum \
 	pid_control ppo_lagrangian sac_lagrangian trust_region trust_region_loss trust_region_optimum \
 	trust_region_step violation))
 
-.PHONY: train test test-kernels test-slow test-wheel compare paper sweep profile gallery bench draws ray \
-	docs lint format type clean
+.PHONY: train test test-kernels test-slow test-wheel test-safety-gymnasium compare paper sweep profile \
+	gallery bench draws ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -28,6 +31,9 @@ test-kernels: $(READY)  ## the numerical tests once more, as another processor r
 
 test-slow: $(READY)  ## every combination, and the tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m slow $(ARGS)
+
+test-safety-gymnasium: $(SAFETY)/.ready  ## with Safety-Gymnasium itself, in an environment of its own
+	OMP_NUM_THREADS=1 $(SAFETY)/bin/pytest tests/with_safety_gymnasium $(ARGS)
 
 test-wheel:  ## the package as people get it: an empty environment, with and without the arms
 	PYTHON=$(PYTHON) .ci/test-wheel
@@ -72,9 +78,16 @@ type: $(READY)
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) runs docs/_build docs/tutorials
+	rm -rf $(VENV) $(SAFETY) runs docs/_build docs/tutorials
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+$(SAFETY)/.ready: pyproject.toml constraints.txt $(SAFETY_FILES)
+	$(PYTHON) -m venv $(SAFETY)
+	$(SAFETY)/bin/pip install --quiet --constraint constraints.txt --editable . pytest
+	$(SAFETY)/bin/pip install --quiet --no-deps --requirement tests/with_safety_gymnasium/requirements.txt
+	$(SAFETY)/bin/python tests/with_safety_gymnasium/make_importable.py
 	touch $@

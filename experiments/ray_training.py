@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -84,9 +85,14 @@ def cluster(address: str | None) -> Iterator[str]:
     if address is not None:
         yield address
         return
-    local = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    local.add_node(num_cpus=2)
+    # Ray runs actors at a niceness of 15. Beside other work on this machine they would get a few
+    # percent of a core, and take minutes to import what they need.
+    os.environ.setdefault("RAY_worker_niceness", "0")
+    local = Cluster()
     try:
+        for num_cpus in (1, 2):  # Ray itself would wait for half a minute.
+            local.add_node(num_cpus=num_cpus, wait=False)
+            local.wait_for_nodes(timeout=300)
         yield local.address
     finally:
         ray.shutdown()
@@ -127,7 +133,7 @@ class Collection:
         batches, fresh = iter(self.collector), True
         while True:
             try:
-                self.collector.update_policy_weights_()
+                self._send_weights()
                 batch = next(batches)
             except _DIED as error:
                 if fresh:  # They would die again and again.
@@ -139,6 +145,20 @@ class Collection:
                 continue
             fresh = False
             yield batch
+
+    def _send_weights(self) -> None:
+        """Raises one of ``_DIED`` if an actor is dead."""
+        try:
+            self.collector.update_policy_weights_()
+        except ray.exceptions.RayError:
+            raise
+        except RuntimeError:
+            # The weights go through a connection of their own, which may break before Ray says
+            # that the actor at its other end is dead.
+            for actor in self.collector.remote_collectors:
+                with suppress(ray.exceptions.GetTimeoutError):  # Busy, so not dead.
+                    ray.get(actor.__ray_ready__.remote(), timeout=10)
+            raise
 
     def close(self) -> None:
         """Ends the actors; the cluster goes on."""

@@ -1,5 +1,7 @@
 """Fixtures shared by the tests."""
 
+import multiprocessing
+
 import pytest
 import torch
 from worlds import ENGINES, turntable_settings
@@ -34,6 +36,15 @@ def engine(request, monkeypatch):
 def turntable(tmp_path):
     """Settings of an ArmEnv with a bar that turns about a vertical axis."""
     return turntable_settings(tmp_path)
+
+
+@pytest.fixture
+def forked_workers():
+    """TorchRL makes spawning the default, which takes seconds for each worker."""
+    before = multiprocessing.get_start_method()
+    multiprocessing.set_start_method("fork", force=True)
+    yield
+    multiprocessing.set_start_method(before, force=True)
 
 
 @pytest.fixture(autouse=True)

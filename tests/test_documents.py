@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Composite, Unbounded
+from torchrl.modules import MLP
 
 from torchrl_safe.envs import ArmEnv, NoObstacles
+from torchrl_safe.policy import save_policy
 
 ROOT = Path(__file__).parent.parent
 
@@ -101,6 +105,18 @@ def test_readme_recipes(tmp_path):
     assert all(0.8 < last / first < 1.25 for first, last in pairwise(multipliers))
     assert max(multipliers) == multipliers[39] > 5 * multipliers[0]
     assert multipliers[-1] < multipliers[39] / 2
+
+
+def test_deploying_a_policy(tmp_path):
+    """What docs/robustness.md does with a file, on few episodes."""
+    actor = TensorDictModule(MLP(40, 3), ["observation"], ["action"])
+    save_policy(tmp_path / "policy.pt", actor, Composite(observation=Unbounded(40)))
+    load, measure = code_of("docs/robustness.md")[-2:]
+    short = measure.replace("num_envs=32", "num_envs=2").replace("256", "2")
+    assert short != measure
+    show = "print(action.shape, len(figures))\n"
+    (tmp_path / "deploy.py").write_text(load + short + show, encoding="utf-8")
+    assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-1] == "(3,) 5"
 
 
 def test_environments(tmp_path):

@@ -22,6 +22,7 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from experiments.algorithms import ALGORITHMS
 from experiments.config import Config
 from experiments.train import make_env, train
+from torchrl_safe import envs
 from torchrl_safe.envs import ArmEnv, Collision, FullObservation, InFront, Placement, Reach
 from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss
 
@@ -389,3 +390,23 @@ def test_every_algorithm_goes_on(algorithm, settings, tmp_path):
     settings = {"frames": 640, "frames_per_batch": 320, "envs": 8, "workers": 1, **settings}
     actor, _ = train(Config(out=tmp_path, epochs=2, **settings), algorithm, progress=False)
     assert all(parameter.isfinite().all() for parameter in actor.parameters())
+
+
+@pytest.mark.parametrize("value", [None, 1, "yes", np.zeros((2, 2)), torch.zeros(3)], ids=repr)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (envs.JointDelta, "respect_limits"),
+        (envs.Collision, "table"),
+        (envs.Collision, "itself"),
+        (envs.Speed, "any_link"),
+        (envs.Reach, "sparse"),
+        (envs.Push, "sparse"),
+        (envs.PickAndPlace, "sparse"),
+        (envs.Scene, "merged_links"),
+        (envs.Sensing, "tool"),
+    ],
+)
+def test_a_flag_that_is_neither_true_nor_false_is_named(kind, name, value):
+    with pytest.raises(TypeError, match=f"{name} must be True or False, got"):
+        kind(**{name: value})

@@ -34,7 +34,7 @@ def load(package):
 
 def test_the_losses_need_no_simulator():
     loaded = load("torchrl_safe.objectives")
-    assert "torchrl_safe.objectives.ppo_lagrangian" in loaded
+    assert "torchrl_safe.objectives.on_policy.ppo_lagrangian" in loaded
     others = {name for name in loaded if not name.startswith("torchrl_safe.objectives")}
     assert others == {"torchrl_safe._checks"}
 

@@ -85,7 +85,10 @@ def test_multiplier_zero_is_the_wrapped_loss_bit_for_bit(parent, precomputed, nu
     batch = make_batch(num_costs)
     if precomputed:
         batch = loss.estimate_advantages(batch).reshape(-1)
-    losses, expected = loss(batch.clone()), expected_loss(batch.clone())
+    losses = loss(batch.clone())
+    if not precomputed:  # Where there are no advantages, the loss does this itself.
+        batch = loss.estimate_advantages(batch)
+    expected = expected_loss(batch)
     assert_same_outputs(losses, expected)
     extra = {"loss_cost_critic", "cost_explained_variance"}
     extra |= {f"lagrange_multiplier_{index}" for index in range(num_costs)}

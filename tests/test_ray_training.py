@@ -1,6 +1,7 @@
 """Training on a real Ray cluster, a head and a worker on this machine, with an actor killed."""
 
 import csv
+import time
 
 import pytest
 import ray
@@ -16,6 +17,14 @@ from torchrl_safe.policy import load_policy
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
 
 SMALL = Config(envs=2, frames=480, frames_per_batch=160)
+
+
+def is_dead(actor):
+    try:
+        ray.get(actor.__ray_ready__.remote())
+    except ray.exceptions.RayActorError:
+        return True
+    return False
 
 
 def test_two_costs_and_their_multipliers(tmp_path, capsys):
@@ -56,8 +65,13 @@ def test_an_actor_is_killed_on_the_way():
             with torch.no_grad():
                 for parameter in training.actor.parameters():
                     parameter.fill_(0.125)
-            # While the learner learns: the next thing it does is to send its weights.
-            ray.kill(collection.collector.remote_collectors[0])
+            # While the learner learns: the next thing it does is to send its weights, through a
+            # connection that is broken by then.
+            victim = collection.collector.remote_collectors[0]
+            ray.kill(victim)
+            while not is_dead(victim):
+                time.sleep(0.1)
+            time.sleep(2)
             second = next(batches)
             assert collection.replaced == 1
             assert second.shape == first.shape
@@ -66,5 +80,9 @@ def test_an_actor_is_killed_on_the_way():
             torch.testing.assert_close(second["loc"], expected)
             assert len(next(batches)) == 2
             assert collection.replaced == 1
+            # And before anybody knows that it is dead.
+            ray.kill(collection.collector.remote_collectors[1])
+            assert len(next(batches)) == 2
+            assert collection.replaced == 2
         finally:
             collection.close()

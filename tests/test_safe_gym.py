@@ -3,7 +3,6 @@
 All numbers are those of counting.py: in step t, observation t, reward 10 t, cost t / 4.
 """
 
-import multiprocessing
 from functools import partial
 
 import gymnasium
@@ -12,8 +11,7 @@ import pytest
 import torch
 from counting import Counting, Forgetful
 from gymnasium.spaces import Box, Dict
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from torchrl.collectors import Collector
 from torchrl.data import Unbounded
 from torchrl.envs import (
@@ -93,15 +91,6 @@ def test_made_by_gymnasium(make_env, mode):
     check_counts(env.rollout(5, break_when_any_done=False), [2, 2, 2])
 
 
-@pytest.fixture
-def forked_workers():
-    """TorchRL makes spawning the default, which takes seconds for each worker."""
-    before = multiprocessing.get_start_method()
-    multiprocessing.set_start_method("fork", force=True)
-    yield
-    multiprocessing.set_start_method(before, force=True)
-
-
 def test_made_by_name_and_vectorized(make_env, forked_workers):
     """TorchRL's own GymEnv returns zeros for the last observations here."""
     env = make_env(SafeGymEnv, "counting:Counting-v0", num_envs=2, steps=4)
@@ -135,6 +124,45 @@ def test_same_step_resets_only_what_is_done(make_env):
         env.reset(started)
 
 
+def test_environments_that_end_together_are_reset_once(make_env):
+    """They have reset themselves; a reset of a simulator may take a second."""
+    resets = []
+
+    class Resets(Counting):
+        def reset(self, **kwargs):
+            resets.append(self)
+            return super().reset(**kwargs)
+
+    env = make_env(
+        SafeGymWrapper, vector(AutoresetMode.SAME_STEP, partial(Resets, 3), partial(Resets, 3))
+    )
+    resets.clear()
+    check_counts(env.rollout(8, break_when_any_done=False), [3, 3])
+    # For the rollout, and for the two ends in it.
+    assert len(resets) == 2 * 3
+    # Asked for, a reset is one.
+    env.reset()
+    assert len(resets) == 2 * 4
+
+
+def test_an_array_that_is_used_again(make_env):
+    class Reuses(Counting):
+        def __init__(self):
+            super().__init__()
+            self.array = np.zeros(1, np.float32)
+
+        def reset(self, **kwargs):
+            self.array[:] = 0
+            return self.array, super().reset(**kwargs)[1]
+
+        def step(self, action):
+            observation, *others = super().step(action)
+            self.array[:] = observation
+            return self.array, *others
+
+    check_counts(make_env(SafeGymWrapper, Reuses()).rollout(9, break_when_any_done=False), [4])
+
+
 KEYS = [("costs", "count"), "cost", ("costs", "one")]
 
 
@@ -155,36 +183,6 @@ def own(rollout):
 
 def row(mode):
     return [4] if mode is None else [4, 3]
-
-
-class SixTupleVector(VectorEnv):
-    """Two rows that return the cost as Safety-Gymnasium's vector environments do."""
-
-    num_envs = 2
-    single_observation_space = Counting.observation_space
-    single_action_space = Counting.action_space
-    observation_space = batch_space(single_observation_space, 2)
-    action_space = batch_space(single_action_space, 2)
-
-    def __init__(self, mode):
-        self.inner = vector(mode)
-        self.autoreset_mode = mode
-        self.metadata = {"autoreset_mode": mode}
-
-    def reset(self, **kwargs):
-        return self.inner.reset(**kwargs)
-
-    def step(self, actions):
-        *outcome, terminated, truncated, info = self.inner.step(actions)
-        # The reward is ten times the count, the cost a quarter of it.
-        return *outcome, outcome[1] / 40, terminated, truncated, info
-
-
-@by_mode
-def test_six_tuples_of_a_vector(make_env, mode):
-    env = make_env(SafeGymWrapper, SixTupleVector(mode))
-    check_env_specs(env)
-    check_counts(env.rollout(13, break_when_any_done=False), [4, 3])
 
 
 @by_mode

@@ -103,8 +103,6 @@ def test_our_on_policy_losses_pass(name, check):
 @pytest.mark.parametrize("check", named(OFF_POLICY_CHECKS))
 @pytest.mark.parametrize("name", OFF_POLICY)
 def test_our_off_policy_losses_pass(name, check):
-    if (name, check) == ("td3", testing.check_dispatch):
-        pytest.xfail("select_out_keys of TD3LagrangianLoss fails, see issue 16, 2.5")
     check(OFF_POLICY[name], **off_policy(name))
 
 

@@ -18,14 +18,14 @@ from torchrl_safe.objectives import (
     PIDControl,
     ViolationUpdater,
 )
-from torchrl_safe.trainers import PPOLagrangianTrainer
+from torchrl_safe.trainers import ConstrainedPPOTrainer
 from torchrl_safe.trainers.configs import (
     ArmEnvConfig,
+    ConstrainedPPOTrainerConfig,
     CRPOLossConfig,
     DualAscentConfig,
     LagrangianLossConfig,
     PIDControlConfig,
-    PPOLagrangianTrainerConfig,
     ViolationUpdaterConfig,
     register_configs,
 )
@@ -86,10 +86,10 @@ def same(configured, default):
 
 
 def test_the_arguments_of_the_trainer():
-    fields = set(PPOLagrangianTrainerConfig.__dataclass_fields__)
-    ours = inspect.signature(PPOLagrangianTrainer).parameters
+    fields = set(ConstrainedPPOTrainerConfig.__dataclass_fields__)
+    ours = inspect.signature(ConstrainedPPOTrainer).parameters
     assert set(ours) - {"kwargs"} <= fields
-    node = OmegaConf.structured(PPOLagrangianTrainerConfig)
+    node = OmegaConf.structured(ConstrainedPPOTrainerConfig)
     for name in ("frame_skip", "optim_steps_per_batch", "gamma", "lmbda", "add_gae", "gae"):
         assert node[name] == ours[name].default
     for name in ("done_key", "episode_cost_key", "cost_names"):
@@ -101,7 +101,7 @@ def test_the_documented_configuration(example):
     """Everything in it is what it names, and the collector has the very policy of the loss."""
     trainer = instantiate(read(example).trainer)
     collector, loss = trainer.collector, trainer.loss_module
-    assert isinstance(trainer, PPOLagrangianTrainer)
+    assert isinstance(trainer, ConstrainedPPOTrainer)
     assert collector.env.base_env.arm == IIWA
     assert isinstance(loss, LagrangianLoss)
     assert next(collector.policy.parameters()) is next(loss.actor_network.parameters())

@@ -34,7 +34,7 @@ from torchrl_safe.objectives import (
     ViolationUpdater,
 )
 from torchrl_safe.testing import ConstrainedBandit, make_batch, make_networks
-from torchrl_safe.trainers import MultiplierHook, PPOLagrangianTrainer
+from torchrl_safe.trainers import ConstrainedPPOTrainer, MultiplierHook
 
 WORLDS, STEPS, FRAMES = 4, 5, 40
 
@@ -64,7 +64,7 @@ class Arm:
         self.buffer = make_buffer(FRAMES, FRAMES // 2)
         self.collector = make_collector(env, actor, FRAMES)
 
-    def trainer(self, kind=PPOLagrangianTrainer, batches=2, **settings):
+    def trainer(self, kind=ConstrainedPPOTrainer, batches=2, **settings):
         """A trainer of these parts."""
         return kind(
             collector=self.collector,
@@ -319,7 +319,7 @@ def test_the_hook_in_a_sac_trainer(tmp_path):
 
 
 def plain_loop(arm, batches):
-    """What PPOLagrangianTrainer does, written out."""
+    """What ConstrainedPPOTrainer does, written out."""
     torch.manual_seed(arm.collector.set_seed(1, static_seed=False))
     for _, batch in zip(range(batches), arm.collector, strict=False):
         arm.updater.step(batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)])
@@ -380,7 +380,7 @@ def test_worker_processes():
         total_frames=3 * FRAMES,
         auto_register_policy_transforms=False,
     )
-    trainer = PPOLagrangianTrainer(
+    trainer = ConstrainedPPOTrainer(
         collector=collector,
         total_frames=3 * FRAMES,
         loss_module=loss,
@@ -472,7 +472,7 @@ def test_every_loss_that_one_optimizer_minimizes(make, rule):
     rate = {"lr": 1.0} if rule is DualAscent else {}
     updater = rule(loss, cost_limit=0.0, **rate)
     before = [parameter.clone() for parameter in loss.parameters()]
-    PPOLagrangianTrainer(
+    ConstrainedPPOTrainer(
         collector=make_collector(env, actor, env.batch_size.numel()),
         total_frames=env.batch_size.numel(),
         loss_module=loss,
@@ -492,13 +492,13 @@ def test_every_loss_that_one_optimizer_minimizes(make, rule):
 def test_losses_with_a_loop_of_their_own(make):
     loss = make(*make_networks())
     with pytest.raises(ValueError, match="loss_module must be minimized as it stands, got"):
-        PPOLagrangianTrainer(loss_module=loss, updater=None, collector=None, total_frames=1)
+        ConstrainedPPOTrainer(loss_module=loss, updater=None, collector=None, total_frames=1)
 
 
 def test_a_loss_without_costs():
     loss = ClipPPOLoss(*make_networks()[:2])
     with pytest.raises(TypeError, match=r"loss_module must be .* cost critic, .* got ClipPPOLoss"):
-        PPOLagrangianTrainer(loss_module=loss, updater=None, collector=None, total_frames=1)
+        ConstrainedPPOTrainer(loss_module=loss, updater=None, collector=None, total_frames=1)
 
 
 def test_a_trainer_that_sees_no_batches(make_arm):

@@ -11,7 +11,7 @@ from torch.distributions import Categorical, kl_divergence
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
 from torchrl_safe.objectives import CPO, PCPO, TRPO, TrustRegionProblem
-from torchrl_safe.objectives.trust_region import (
+from torchrl_safe.objectives.trust_region.solver import (
     NotPositiveDefiniteError,
     backtracking_line_search,
     conjugate_gradient,

@@ -480,10 +480,13 @@ class Tied(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.first, self.second = nn.Linear(OBSERVATION, OBSERVATION), nn.Linear(OBSERVATION, 3)
-        self.again = nn.Linear(OBSERVATION, OBSERVATION)
+        self.first, self.second = (
+            nn.Linear(OBSERVATION_SIZE, OBSERVATION_SIZE),
+            nn.Linear(OBSERVATION_SIZE, 3),
+        )
+        self.again = nn.Linear(OBSERVATION_SIZE, OBSERVATION_SIZE)
         self.again.weight = self.first.weight
-        self.norm = nn.BatchNorm1d(OBSERVATION)
+        self.norm = nn.BatchNorm1d(OBSERVATION_SIZE)
 
     def forward(self, observation):
         return self.second(self.again(self.norm(self.first(observation).tanh())).tanh())
@@ -516,12 +519,14 @@ def test_every_part_of_an_action_counts():
     """A distribution that is not summed over its parts: each has its own ratio and divergence."""
     loss = PPOLoss(normal_actor(Normal), make_critic(), entropy_bonus=False)
     torch.manual_seed(0)
-    data = act(loss, TensorDict(observation=torch.randn(BATCH, OBSERVATION), batch_size=[BATCH]))
+    data = act(
+        loss, TensorDict(observation=torch.randn(BATCH, OBSERVATION_SIZE), batch_size=[BATCH])
+    )
     data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1)
     old, before = distribution(loss, data), loss(data)["loss_objective"]
     info = TrustRegionStep(loss, max_kl=MAX_KL).step(data)
     kl = kl_divergence(old, distribution(loss, data))
-    assert kl.shape == (BATCH, ACTION)
+    assert kl.shape == (BATCH, ACTION_SIZE)
     torch.testing.assert_close(info["kl"], kl.mean())
     gain = before - loss(data)["loss_objective"]
     torch.testing.assert_close(info["surrogate_gain"], gain, rtol=0, atol=1e-6)

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe._checks import check_array, check_positive
+from torchrl_safe._checks import check_array, check_flag, check_positive
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
@@ -172,6 +172,7 @@ class JointDelta:
     def __post_init__(self) -> None:
         check_positive(step=self.step)
         _check_bound(self.bound)
+        check_flag(respect_limits=self.respect_limits)
         if self.finger_step is not None:
             check_positive(finger_step=self.finger_step)
 
@@ -200,5 +201,9 @@ def _finger_targets(action: Array, state: ArmState, step: float | None) -> Array
 
 
 def _check_bound(bound: float) -> None:
-    if not isinstance(bound, Real) or not bound > 0:
+    try:
+        usable = isinstance(bound, Real) and float(bound) > 0
+    except OverflowError:  # A whole number beyond all floats.
+        usable = False
+    if not usable:
         raise ValueError(f"bound must be positive, got {bound!r}.")

@@ -11,7 +11,7 @@ from numbers import Real
 
 import numpy as np
 
-from torchrl_safe._checks import check_kind, check_not_negative, check_positive
+from torchrl_safe._checks import check_flag, check_kind, check_not_negative, check_positive
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.state import ArmState, Array, Sensing
 
@@ -57,6 +57,7 @@ class Collision:
                 f"margin must be between 0 and {CONTACT_RANGE}, where contact points begin, "
                 f"got {self.margin}."
             )
+        check_flag(table=self.table, itself=self.itself)
 
     @property
     def sensing(self) -> Sensing:
@@ -206,6 +207,7 @@ class Speed:
 
     def __post_init__(self) -> None:
         check_not_negative(limit=self.limit)
+        check_flag(any_link=self.any_link)
 
     @property
     def sensing(self) -> Sensing:

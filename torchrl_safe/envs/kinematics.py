@@ -91,7 +91,7 @@ class Approach(NamedTuple):
 
 def approach(
     simulator: Simulator,
-    start: Sequence[float],
+    start: Sequence[float] | Array,
     position: Array,
     orientation: Array | None = None,
     *,

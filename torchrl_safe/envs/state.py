@@ -9,7 +9,7 @@ from typing import NoReturn, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe._checks import check_not_negative
+from torchrl_safe._checks import check_flag, check_not_negative
 
 Array = NDArray[np.float64]
 
@@ -62,6 +62,13 @@ class Sensing:
 
     def __post_init__(self) -> None:
         check_not_negative(clearance=self.clearance)
+        check_flag(
+            table=self.table,
+            itself=self.itself,
+            joints=self.joints,
+            tool=self.tool,
+            links=self.links,
+        )
 
     def __or__(self, other: Sensing) -> Sensing:
         return Sensing(

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe._checks import check_kind, check_positive
+from torchrl_safe._checks import check_flag, check_kind, check_positive
 from torchrl_safe.envs.obstacles.shapes import Box, Shape
 from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.state import ArmState, Array
@@ -72,6 +72,7 @@ class Reach:
 
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
+        check_flag(sparse=self.sparse)
         if not isinstance(self.order, Real) or not self.order >= 1:
             raise ValueError(f"order must be at least 1, got {self.order!r}.")
 
@@ -130,6 +131,7 @@ class Push:
 
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
+        check_flag(sparse=self.sparse)
         _check_object(self.shape)
         check_positive(distance=self.distance)
 
@@ -187,6 +189,7 @@ class PickAndPlace:
 
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
+        check_flag(sparse=self.sparse)
         _check_object(self.shape)
         check_positive(distance=self.distance)
         if not isinstance(self.on_table, Real) or not 0 <= self.on_table <= 1:

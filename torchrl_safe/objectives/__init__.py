@@ -1,21 +1,22 @@
 """Constrained losses and the rules that move their multipliers. Needs TorchRL only."""
 
-from torchrl_safe.objectives.cost_gae import CostGAE
-from torchrl_safe.objectives.cost_td0 import CostTD0
-from torchrl_safe.objectives.crpo import CRPOLoss
-from torchrl_safe.objectives.cup import CUPLoss
-from torchrl_safe.objectives.focops import FOCOPSLoss
-from torchrl_safe.objectives.functional import penalized_advantage
-from torchrl_safe.objectives.ipo import IPOLoss
-from torchrl_safe.objectives.lagrangian import LagrangianLoss
-from torchrl_safe.objectives.multipliers import DualAscent, MultiplierUpdater
-from torchrl_safe.objectives.p3o import P3OLoss
-from torchrl_safe.objectives.pid_control import PIDControl
-from torchrl_safe.objectives.ppo_lagrangian import PPOLagrangianLoss
-from torchrl_safe.objectives.sac_lagrangian import SACLagrangianLoss
-from torchrl_safe.objectives.td3_lagrangian import TD3LagrangianLoss
-from torchrl_safe.objectives.trust_region_loss import TrustRegionLoss
-from torchrl_safe.objectives.trust_region_methods import (
+from torchrl_safe.objectives.critics.cost_gae import CostGAE
+from torchrl_safe.objectives.critics.cost_td0 import CostTD0
+from torchrl_safe.objectives.functional import penalized_advantage, scaled_advantages
+from torchrl_safe.objectives.off_policy.sac_lagrangian import SACLagrangianLoss
+from torchrl_safe.objectives.off_policy.td3_lagrangian import TD3LagrangianLoss
+from torchrl_safe.objectives.on_policy.crpo import CRPOLoss
+from torchrl_safe.objectives.on_policy.cup import CUPLoss
+from torchrl_safe.objectives.on_policy.focops import FOCOPSLoss
+from torchrl_safe.objectives.on_policy.ipo import IPOLoss
+from torchrl_safe.objectives.on_policy.lagrangian import LagrangianLoss
+from torchrl_safe.objectives.on_policy.p3o import P3OLoss
+from torchrl_safe.objectives.on_policy.ppo_lagrangian import PPOLagrangianLoss
+from torchrl_safe.objectives.rules.multipliers import DualAscent, MultiplierUpdater
+from torchrl_safe.objectives.rules.pid_control import PIDControl
+from torchrl_safe.objectives.rules.violation import ViolationUpdater
+from torchrl_safe.objectives.trust_region.loss import TrustRegionLoss
+from torchrl_safe.objectives.trust_region.methods import (
     CPO,
     PCPO,
     TRPO,
@@ -23,8 +24,7 @@ from torchrl_safe.objectives.trust_region_methods import (
     TrustRegionProblem,
     TrustRegionSolution,
 )
-from torchrl_safe.objectives.trust_region_step import TrustRegionStep
-from torchrl_safe.objectives.violation import ViolationUpdater
+from torchrl_safe.objectives.trust_region.step import TrustRegionStep
 
 __all__ = [
     "CPO",
@@ -51,4 +51,5 @@ __all__ = [
     "TrustRegionStep",
     "ViolationUpdater",
     "penalized_advantage",
+    "scaled_advantages",
 ]

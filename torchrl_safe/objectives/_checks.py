@@ -24,6 +24,8 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
         raise ValueError(f"{name} must be positive, from 1e-18 to 1e18, got {value!r}.")
     if not 0 <= number <= _LARGEST:
         raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
+    if number > _LARGE:  # Times a loss it would soon be infinite.
+        raise ValueError(f"{name} must be at most 1e18, got {value!r}.")
     return number
 
 
@@ -39,6 +41,22 @@ def check_discount(gamma: Tensor) -> None:
     """Raises ValueError unless an episode has 1 / (1 - gamma) steps, a finite number."""
     if not gamma < 1:
         raise ValueError(f"gamma of the costs must be below 1, got {gamma.item()}.")
+
+
+def check_episode_length(episode_length: float | None) -> float | None:
+    """Returns the value; raises ValueError unless it is positive or None."""
+    if episode_length is None:
+        return None
+    return check_number("episode_length", episode_length, positive=True)
+
+
+def check_length_known(episode_length: float | None, gamma: Tensor) -> None:
+    """Raises ValueError if neither the option nor the discount tells the length of an episode."""
+    if episode_length is None and not gamma < 1:
+        raise ValueError(
+            "episode_length must be given if gamma of the costs is 1 or more, got None and gamma "
+            f"{gamma.item()}."
+        )
 
 
 def as_number(value: Any) -> float:

@@ -2,7 +2,89 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
+
+
+def scaled_advantages(
+    advantage: Tensor,
+    cost_advantage: Tensor,
+    *,
+    counted: Tensor | None = None,
+    standardize: bool = True,
+    centre: bool = True,
+    exclude_dims: Sequence[int] = (),
+) -> tuple[Tensor, Tensor]:
+    r"""Scales the advantages of a whole batch: this is where all on-policy losses do it.
+
+    .. math::
+        \hat A_r = \frac{A_r - \overline{A_r}}{\mathrm{std}(A_r)}, \qquad
+        \hat A_{c_i} = A_{c_i} - \overline{A_{c_i}}
+
+    The reward advantage is **standardized**: the objective then does not depend on the scale of
+    the rewards, and a multiplier is in units of a standard deviation of the reward advantage. The
+    advantages of the costs are only **centred**: divided by their standard deviation, a cost that
+    is rarely seen would weigh as much as one that always is, and a multiplier would mean something
+    else from batch to batch. Both are done once over the batch that was collected and before
+    :func:`penalized_advantage` mixes them, so that a multiplier means the same in every
+    minibatch. (Ray et al. 2019 scale them so.)
+
+    Args:
+        advantage (Tensor): reward advantage, shape ``(*B, 1)``.
+        cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
+
+    Keyword Args:
+        counted (Tensor, optional): the steps that count, bool, shape ``(*B, 1)``. Defaults to
+            ``None``, all of them.
+        standardize (bool, optional): whether the reward advantage is. Defaults to ``True``.
+        centre (bool, optional): whether those of the costs are. Defaults to ``True``.
+        exclude_dims (sequence of int, optional): dimensions of the reward advantage that are
+            standardized each on its own, such as that of the agents. Defaults to ``()``.
+
+    Returns:
+        Both advantages, scaled.
+
+    Examples:
+        >>> import torch
+        >>> reward, cost = torch.tensor([[1.0], [3.0]]), torch.tensor([[1.0], [5.0]])
+        >>> scaled_advantages(reward, cost)
+        (tensor([[-0.7071],
+                [ 0.7071]]), tensor([[-2.],
+                [ 2.]]))
+    """
+    if standardize and advantage.numel() > 1:  # One alone has no deviation.
+        advantage = standardized(advantage, counted, exclude_dims)
+    return advantage, centred(cost_advantage, counted) if centre else cost_advantage
+
+
+def standardized(
+    values: Tensor, counted: Tensor | None = None, exclude_dims: Sequence[int] = ()
+) -> Tensor:
+    """Brings values to mean 0 and standard deviation 1, over those that count.
+
+    As TorchRL's ``normalize_advantage``: the deviation of a masked batch is divided by its count.
+    """
+    excluded = {dim % values.ndim for dim in exclude_dims}
+    dims = tuple(dim for dim in range(values.ndim) if dim not in excluded)
+    if counted is None:
+        scale = values.std(dims, keepdim=True).clamp_min(1e-6)
+        return (values - values.mean(dims, keepdim=True)) / scale
+    count = counted.expand_as(values).sum(dims, keepdim=True).clamp_min(1)
+    mean = torch.where(counted, values, 0.0).sum(dims, keepdim=True) / count
+    square = torch.where(counted, values - mean, 0.0).square().sum(dims, keepdim=True)
+    return (values - mean) / (square / count).sqrt().clamp_min(1e-4)
+
+
+def centred(values: Tensor, counted: Tensor | None = None) -> Tensor:
+    """Takes off the mean of each column, over the rows that count."""
+    rows = tuple(range(values.ndim - 1))
+    if counted is None:
+        return values - values.mean(rows, keepdim=True)
+    counted = counted.expand_as(values).contiguous()
+    count = counted.sum(rows, keepdim=True).clamp_min(1)
+    return values - torch.where(counted, values, 0.0).sum(rows, keepdim=True) / count
 
 
 def penalized_advantage(
@@ -55,3 +137,22 @@ def penalized_advantage(
         )
     penalized = advantage - (lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
     return penalized / (1 + lagrange_multiplier.sum()) if rescale else penalized
+
+
+def per_step(episode_length: float | None, gamma: Tensor) -> Tensor | float:
+    r"""What turns an amount per episode into one per step, the unit of a surrogate.
+
+    A surrogate is a mean over steps, a violation one over whole episodes. The papers take
+    :math:`1 - \gamma`, as if every episode had :math:`1 / (1 - \gamma)` steps: one of 40 steps,
+    discounted by 0.99, is then taken for one of 100, and a change of the policy for 2.5 times the
+    change of its cost.
+
+    Args:
+        episode_length (float, optional): mean number of steps of an episode; if ``None``,
+            :math:`1 / (1 - \gamma)`.
+        gamma (Tensor): discount of the costs.
+
+    Returns:
+        The share of one step in an episode.
+    """
+    return 1 - gamma if episode_length is None else 1 / episode_length

@@ -114,12 +114,14 @@ def require(condition: bool, message: str) -> None:
 
 def require_equal(what: str, actual: Any, expected: Any) -> None:
     """Raises AssertionError unless both are the same, bit for bit."""
-    require_close(what, actual, expected, rtol=0.0, atol=0.0)
+    torch.testing.assert_close(
+        actual, expected, rtol=0.0, atol=0.0, msg=lambda text: f"{what}: {text}"
+    )
 
 
-def require_close(what: str, actual: Any, expected: Any, **tolerances: float) -> None:
+def require_close(what: str, actual: Any, expected: Any) -> None:
     """Raises AssertionError, which says what differs and how much, unless both are close."""
-    torch.testing.assert_close(actual, expected, msg=lambda text: f"{what}: {text}", **tolerances)
+    torch.testing.assert_close(actual, expected, msg=lambda text: f"{what}: {text}")
 
 
 def require_same_outputs(

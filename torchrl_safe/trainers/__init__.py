@@ -4,7 +4,7 @@ Hydra configurations are in ``torchrl_safe.trainers.configs``, which is not impo
 the ``hydra`` extra.
 """
 
+from torchrl_safe.trainers.constrained_ppo import ConstrainedPPOTrainer
 from torchrl_safe.trainers.multiplier_hook import MultiplierHook
-from torchrl_safe.trainers.ppo_lagrangian import PPOLagrangianTrainer
 
-__all__ = ["MultiplierHook", "PPOLagrangianTrainer"]
+__all__ = ["ConstrainedPPOTrainer", "MultiplierHook"]

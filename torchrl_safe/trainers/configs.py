@@ -12,7 +12,7 @@ After :func:`register_configs` the groups of TorchRL have these names too, and t
 ``updater=dual_ascent``         :class:`~torchrl_safe.objectives.DualAscent`
 ``updater=pid_control``         :class:`~torchrl_safe.objectives.PIDControl`
 ``updater=violation``           :class:`~torchrl_safe.objectives.ViolationUpdater`, for CRPO
-``trainer=ppo_lagrangian``      :class:`~torchrl_safe.trainers.PPOLagrangianTrainer`
+``trainer=constrained_ppo``      :class:`~torchrl_safe.trainers.ConstrainedPPOTrainer`
 =============================== ==============================================================
 """
 
@@ -38,7 +38,7 @@ from torchrl.trainers.algorithms.configs.trainers import (
     _make_onpolicy_trainer,
 )
 
-from torchrl_safe.trainers.ppo_lagrangian import PPOLagrangianTrainer
+from torchrl_safe.trainers.constrained_ppo import ConstrainedPPOTrainer
 
 
 def _of(target: str, **arguments: Any) -> dict[str, Any]:
@@ -154,8 +154,8 @@ class PIDControlConfig(UpdaterConfig):
 
 
 @dataclass(kw_only=True)  # The parent has fields without a default behind these.
-class PPOLagrangianTrainerConfig(PPOTrainerConfig):
-    """Configuration of :class:`~torchrl_safe.trainers.PPOLagrangianTrainer`.
+class ConstrainedPPOTrainerConfig(PPOTrainerConfig):
+    """Configuration of :class:`~torchrl_safe.trainers.ConstrainedPPOTrainer`.
 
     A ``collector`` with ``_partial_: true`` and no policy of its own gets the policy of the loss;
     a policy that is configured a second time would be another one.
@@ -167,10 +167,10 @@ class PPOLagrangianTrainerConfig(PPOTrainerConfig):
     lmbda: float | None = None
     episode_cost_key: Any = "episode_cost"
     cost_names: Any = None
-    _target_: str = "torchrl_safe.trainers.configs.make_ppo_lagrangian_trainer"
+    _target_: str = "torchrl_safe.trainers.configs.make_constrained_ppo_trainer"
 
 
-def make_ppo_lagrangian_trainer(
+def make_constrained_ppo_trainer(
     *,
     collector: Any,
     loss_module: LossModule,
@@ -178,22 +178,22 @@ def make_ppo_lagrangian_trainer(
     episode_cost_key: Any = "episode_cost",
     cost_names: Any = None,
     **settings: Any,
-) -> PPOLagrangianTrainer:
+) -> ConstrainedPPOTrainer:
     """Makes a trainer of what Hydra has instantiated, as TorchRL's factories do.
 
     Args:
-        collector (BaseCollector or partial): see :class:`PPOLagrangianTrainerConfig`.
+        collector (BaseCollector or partial): see :class:`ConstrainedPPOTrainerConfig`.
         loss_module (LossModule): the loss.
         updater (callable): called with the loss.
-        episode_cost_key (NestedKey or list of str): see ``PPOLagrangianTrainer``.
-        cost_names (sequence of str, optional): see ``PPOLagrangianTrainer``.
-        **settings: the other fields of :class:`PPOLagrangianTrainerConfig`.
+        episode_cost_key (NestedKey or list of str): see ``ConstrainedPPOTrainer``.
+        cost_names (sequence of str, optional): see ``ConstrainedPPOTrainer``.
+        **settings: the other fields of :class:`ConstrainedPPOTrainerConfig`.
     """
     if isinstance(collector, partial):
         own = {"policy", "policy_factory"} & {k for k, v in collector.keywords.items() if v}
         collector = collector() if own else collector(policy=loss_module.actor_network)
     make = partial(
-        PPOLagrangianTrainer,
+        ConstrainedPPOTrainer,
         updater=updater(loss_module),
         episode_cost_key=_normalize_hydra_key(episode_cost_key),
         cost_names=cost_names,
@@ -210,4 +210,4 @@ def register_configs() -> None:
     store(group="updater", name="dual_ascent", node=DualAscentConfig)
     store(group="updater", name="pid_control", node=PIDControlConfig)
     store(group="updater", name="violation", node=ViolationUpdaterConfig)
-    store(group="trainer", name="ppo_lagrangian", node=PPOLagrangianTrainerConfig)
+    store(group="trainer", name="constrained_ppo", node=ConstrainedPPOTrainerConfig)

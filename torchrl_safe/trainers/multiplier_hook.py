@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_safe.objectives._cost_updater import CostUpdater, check_names
+from torchrl_safe.objectives.rules.cost_updater import CostUpdater, check_names
 
 
 class MultiplierHook(TrainerHookBase):

@@ -13,18 +13,17 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
-from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data.utils import torch_to_numpy_dtype_dict
 from torchrl.envs import EnvBase, GymEnv, GymWrapper
 from torchrl.envs.gym_like import BaseInfoDictReader
 from torchrl.envs.libs.gym import terminal_obs_reader
 
 from torchrl_safe._checks import check_array
-
-Info = Mapping[str, Any]
+from torchrl_safe.envs.gym import autoreset, safety_gymnasium
 
 
 class _CostBesideReward(GymWrapper):
@@ -46,20 +45,36 @@ class _CostBesideReward(GymWrapper):
         """Key of the reward alone: TorchRL's own code writes the reward there."""
         return "reward"
 
-    def read_reward(self, reward: Any) -> Tensor:
-        return self.full_reward_spec["reward"].encode(reward, ignore_device=True)
-
     def _make_specs(self, env: gymnasium.Env) -> None:
         super()._make_specs(env)
+        # For _step: asking an environment for its specs takes longer than encoding a value.
+        box = isinstance(self.action_spec, Bounded | Unbounded) and self._convert_actions_to_numpy
+        self._box_action_key = self.action_key if box else None
+        self._one_observation = next(iter(self.observation_spec.items(True, True)))
+        reward = self.full_reward_spec["reward"]
+        self._one_reward = reward
+        self._flag_shape = (*self.batch_size, 1)
         self.reward_spec = Composite(
-            reward=self.full_reward_spec["reward"],
+            reward=reward,
             cost=Unbounded(
                 (*self.batch_size, len(self._cost_paths)), dtype=torch.float32, device=self.device
             ),
             shape=self.batch_size,
         )
-        self._started: Any = None
-        self._same_step = self._is_batched and self._env.autoreset_mode == AutoresetMode.SAME_STEP
+        self._cost = np.zeros(self.full_reward_spec["cost"].shape)
+        # Which environments have reset themselves in the last step, and all their observations.
+        self._started: tuple[NDArray[np.bool_], Any] | None = None
+        self._vectorized = self._is_batched
+        self._resets_itself = self._vectorized and autoreset.resets_itself(self._env)
+
+    def read_reward(self, reward: Any) -> Tensor:
+        return _encode(self._one_reward, reward)
+
+    def read_obs(self, observations: Any) -> dict[str, Any]:
+        if isinstance(observations, Mapping):
+            return super().read_obs(observations)
+        key, spec = self._one_observation
+        return {key: _encode(spec, observations)}
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
         # TorchRL 0.14.1 takes it for granted that a tensordict has a mask.
@@ -71,95 +86,100 @@ class _CostBesideReward(GymWrapper):
         *,
         info_dict_reader: BaseInfoDictReader | None = None,
     ) -> EnvBase:
-        # For SAME_STEP, TorchRL registers this reader to find the last observations. It also makes
-        # an observation of every entry of info, fails on nested ones, and lets a full reset return
-        # observations of the episode before. Here _output_transform finds them.
+        # Where environments reset themselves, TorchRL registers this reader to find the last
+        # observations. It also makes an observation of every entry of info, fails on nested ones,
+        # lets a full reset return observations of the episode before, and finds nothing under the
+        # names of Gymnasium 0.28: NaN then. Here _output_transform finds them.
         if isinstance(info_dict_reader, terminal_obs_reader):
             return self
         return super().auto_register_info_dict(ignore_private, info_dict_reader=info_dict_reader)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if not self._same_step or mask is None or mask.all():
+        started, self._started = self._started, None
+        if started is not None and mask is not None and not kwargs:
+            done, observation = started
+            if np.array_equal(mask.numpy(force=True).reshape(done.shape), done):
+                source = self.read_obs(observation)
+                return TensorDict(source, self.batch_size, device=self.device)
+        if not self._resets_itself or mask is None or mask.all():
             return super()._reset(tensordict, **kwargs)
-        if self._started is None:
-            raise RuntimeError("In SAME_STEP, only environments that are done can be reset apart.")
-        return TensorDict(self.read_obs(self._started), self.batch_size, device=self.device)
+        raise RuntimeError(
+            "They reset themselves: only environments that are done can be reset apart from the "
+            "others."
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # With a frame_skip, _output_transform is called several times; costs add up as rewards do.
-        self._cost = np.zeros(self.full_reward_spec["cost"].shape)
-        after = super()._step(tensordict)
-        if self._same_step:
+        action = self._action_of(tensordict)
+        reward: Any = 0
+        self._cost.fill(0)  # _output_transform adds to it.
+        for _ in range(self.wrapper_frame_skip):
+            outcome = self._output_transform(self._env.step(action))
+            observation, frame_reward, terminated, truncated, done, info = outcome
+            reward = reward + frame_reward
+            if done.any() if self._vectorized else done:
+                break
+        source = self.read_obs(observation)
+        source["reward"] = self.read_reward(reward)
+        source["cost"] = torch.from_numpy(self._cost.astype(np.float32))
+        for name, flag in (("terminated", terminated), ("truncated", truncated), ("done", done)):
+            source[name] = torch.from_numpy(np.array(flag, np.bool_).reshape(self._flag_shape))
+        after = TensorDict(source, self.batch_size)
+        if self.device is not None:
+            after = after.to(self.device)
+        if self._resets_itself:
             # Tells TorchRL's VecGymEnvTransform that nothing is left to be replaced.
             after["final"] = TensorDict(batch_size=self.batch_size)
-        return after.set("cost", torch.from_numpy(self._cost).to(torch.float32))
+        for reader in self.info_dict_reader:
+            read = reader(info, after)
+            after = after if read is None else read
+        return after
+
+    def _action_of(self, tensordict: TensorDictBase) -> Any:
+        if self._box_action_key is not None:
+            return tensordict.get(self._box_action_key).detach().cpu().numpy()
+        keys = self.action_keys
+        action = tensordict[keys[0]] if len(keys) == 1 else tensordict.select(*keys).to_dict()
+        return self.read_action(action) if self._convert_actions_to_numpy else action
 
     def _output_transform(self, step_outputs_tuple: tuple) -> tuple:
         # Safety-Gymnasium returns the cost between the reward and the flags.
         observation, reward, *cost, terminated, truncated, info = step_outputs_tuple
         done = terminated | truncated
-        if self._same_step and done.any():
-            self._started = observation
-            observation = self._last_observation(observation, info, done)
-            info = _last_info(info, info.get("final_info", {}), done)
+        self._started = None
+        if self._resets_itself and done.any():
+            self._started = done, observation
+            observation = autoreset.last_observation(self._env, observation, info, done)
+            info = autoreset.last_info(info, done)
         for column, path in enumerate(self._cost_paths):
             own = cost and path == ("cost",)
             value = cost[0] if own else _look_up(info, path)
-            shape = self._cost[..., column].shape
-            self._cost[..., column] += check_array(f"cost {'.'.join(path)!r}", value, shape)
+            self._cost[..., column] += self._checked(path, value)
         return observation, reward, terminated, truncated, done, info
 
-    def _last_observation(self, observation: Any, info: Info, done: np.ndarray) -> Any:
-        """The observations of the step, also where the environment has been reset since."""
-        rows = [
-            last if over else now
-            for over, last, now in zip(
-                done,
-                info["final_obs"],
-                iterate(self._env.observation_space, observation),
-                strict=True,
-            )
-        ]
-        space = self._env.single_observation_space
-        empty: Any = create_empty_array(space, len(rows))
-        return concatenate(space, rows, empty)
+    def _checked(self, path: tuple[str, ...], value: Any) -> Any:
+        # What a single environment nearly always returns is told from the rest without an array.
+        if type(value) is float and not self._vectorized and abs(value) <= 1:
+            return value
+        return check_array(f"cost {'.'.join(path)!r}", value, self._cost.shape[:-1])
 
 
-def _last_info(info: Info, last: Info, done: np.ndarray) -> dict[str, Any]:
-    """The info of the step, which stands in ``final_info`` where the environment has been reset."""
-    merged: dict[str, Any] = {}
-    for name in {*info, *last} - {"final_info", "final_obs"}:
-        if name.startswith("_"):
-            continue
-        entry, last_entry = info.get(name), last.get(name)
-        if isinstance(entry, Mapping) or isinstance(last_entry, Mapping):
-            merged[name] = _last_info(entry or {}, last_entry or {}, done)
-            continue
-        example = np.asarray(entry if last_entry is None else last_entry)
-        absent = np.zeros_like(example)
-        merged[name] = np.where(
-            done.reshape(-1, *(1,) * (example.ndim - 1)),
-            absent if last_entry is None else last_entry,
-            absent if entry is None else entry,
-        )
-        # The mask of the environments that have the entry.
-        merged[f"_{name}"] = np.where(
-            done,
-            last.get(f"_{name}", last_entry is not None),
-            info.get(f"_{name}", entry is not None),
-        )
-    return merged
+def _encode(spec: TensorSpec, value: Any) -> Tensor:
+    """The tensor for a value; numbers by a copy, which is faster than ``spec.encode``."""
+    if not isinstance(spec, Bounded | Unbounded):
+        return spec.encode(value, ignore_device=True)
+    dtype = torch_to_numpy_dtype_dict[spec.dtype]
+    return torch.from_numpy(np.array(value, dtype).reshape(spec.shape))
 
 
-def _look_up(info: Info, path: tuple[str, ...]) -> Any:
+def _look_up(info: Any, path: tuple[str, ...]) -> Any:
     """The entry of an info; raises unless every environment has it."""
-    entry: Any = info
-    present: Any = True
+    entry, present = info, True
     for name in path:
-        if not isinstance(entry, Mapping) or name not in entry:
+        known = autoreset.entries(entry)
+        if name not in known:
             raise KeyError(f"info must have {path} in every step, got only {[*info]}.")
-        entry, present = entry[name], entry.get(f"_{name}", True)
+        entry, present = known[name], known.get(f"_{name}", True)
     # Gymnasium's mask of the environments that have the entry, if the info is of several.
     if isinstance(present, np.ndarray) and not present.all():
         rows = np.flatnonzero(~present).tolist()
@@ -175,7 +195,8 @@ class SafeGymWrapper(_CostBesideReward):
     are six, as in Safety-Gymnasium. ``reset`` returns none.
 
     Vectorized environments may reset in the modes that TorchRL supports, ``DISABLED`` and
-    ``SAME_STEP``; the last observation, reward and cost of an episode are the true ones in both.
+    ``SAME_STEP``; the last observation, reward and cost of an episode are the true ones in both,
+    and in the vectorized environments of Gymnasium 0.28 and Safety-Gymnasium, which know no modes.
     Gymnasium gives an entry of a vectorized info the type it has in the first environment: a cost
     must be a float everywhere, or its fractions are lost.
 
@@ -209,7 +230,8 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
     As :class:`SafeGymWrapper`, with the name of a registered environment.
 
     Args:
-        env_name (str): name in Gymnasium's registry.
+        env_name (str): name in Gymnasium's registry, or of Safety-Gymnasium, which is imported
+            for it: ``"SafetyPointGoal1-v0"``, ``"SafetyPointGoal1Gymnasium-v0"``.
 
     Keyword Args:
         cost_keys (Sequence[NestedKey], optional): the entries of ``info`` that are costs.
@@ -233,16 +255,21 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
     @property
     def lib(self) -> Any:
         # All that TorchRL 0.14.1 takes from it is `make`.
-        return SimpleNamespace(make=partial(_make, super().lib))
+        return SimpleNamespace(make=partial(_make, self._maker.make))
 
-    def _async_env(self, factories: Sequence[Callable[[], gymnasium.Env]]) -> AsyncVectorEnv:
-        # In Gymnasium's default mode TorchRL 0.14.1 overwrites the last observations with zeros.
-        return AsyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
+    def _build_env(self, env_name: str, **kwargs: Any) -> Any:
+        self._maker, name = safety_gymnasium.find_maker(env_name)
+        return super()._build_env(name, **kwargs)
+
+    def _async_env(self, factories: Sequence[Callable[[], gymnasium.Env]]) -> Any:
+        if self._maker is gymnasium:
+            return autoreset.async_vector_env(factories)
+        return safety_gymnasium.async_vector_env(factories)
 
 
-def _make(lib: Any, env_name: str, **kwargs: Any) -> gymnasium.Env:
+def _make(make: Callable[..., gymnasium.Env], env_name: str, **kwargs: Any) -> gymnasium.Env:
     try:
-        return lib.make(env_name, **kwargs)
+        return make(env_name, **kwargs)
     except TypeError as error:
         # TorchRL tries an argument of this name, and then without it if the error says so. A class
         # without a constructor of its own says only that it takes none.

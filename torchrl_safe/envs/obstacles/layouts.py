@@ -240,11 +240,13 @@ class Scattered:
         check_kind("region", self.region, Region)
         check_kind("shape", self.shape, Shape)
         check_not_negative(clearance=self.clearance, spacing=self.spacing)
-        if self.fewest is not None and self.fewest not in range(self.count + 1):
-            raise ValueError(
-                f"fewest must be a whole number between 0 and count = {self.count}, got "
-                f"{self.fewest}."
-            )
+        if self.fewest is not None:
+            check_count(least=0, fewest=self.fewest)
+            if self.fewest > self.count:
+                raise ValueError(
+                    f"fewest must be a whole number between 0 and count = {self.count}, got "
+                    f"{self.fewest}."
+                )
 
     @property
     def shapes(self) -> tuple[Shape, ...]:

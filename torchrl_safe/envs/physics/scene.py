@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_safe._checks import check_array, check_positive
+from torchrl_safe._checks import check_array, check_flag, check_positive
 
 #: Duration of one physics substep, s.
 SUBSTEP = 1 / 240
@@ -22,6 +22,7 @@ class Scene:
         motor_limits: keep the motors within the efforts and speeds of the URDF.
 
     Raises:
+        TypeError: if a flag is not True or False.
         ValueError: if ``gravity`` is not finite.
 
     Examples:
@@ -35,6 +36,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         check_array("gravity", self.gravity, ())
+        check_flag(free_fingers=self.free_fingers, motor_limits=self.motor_limits)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from torchrl_safe._checks import check_positive
+from torchrl_safe._checks import check_flag, check_positive
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.simulator import BulletSimulator
@@ -37,6 +37,7 @@ class Bullet:
             physics substep late, as PyBullet does unless told otherwise.
 
     Raises:
+        TypeError: if a flag is not True or False.
         ValueError: if ``motor_gain`` is not positive.
 
     Examples:
@@ -54,6 +55,11 @@ class Bullet:
     def __post_init__(self) -> None:
         if self.motor_gain is not None:
             check_positive(motor_gain=self.motor_gain)
+        check_flag(
+            merged_links=self.merged_links,
+            urdf_inertia=self.urdf_inertia,
+            fresh_links=self.fresh_links,
+        )
 
     def build(
         self,

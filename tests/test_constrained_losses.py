@@ -1,0 +1,446 @@
+"""What all constrained on-policy losses share: heads, scaling, delegation, what stays behind."""
+
+import copy
+from functools import partial
+
+import pytest
+import torch
+from on_policy import make_composite
+from tensordict.nn import (
+    NormalParamExtractor,
+    TensorDictModule,
+    set_composite_lp_aggregate,
+)
+from torch import nn
+from torchrl.modules import (
+    ActorValueOperator,
+    IndependentNormal,
+    ProbabilisticActor,
+    ValueOperator,
+)
+from torchrl.objectives import (
+    A2CLoss,
+    ClipPPOLoss,
+    KLPENPPOLoss,
+    LossModule,
+    PPOLoss,
+    ReinforceLoss,
+    SoftUpdate,
+)
+
+from torchrl_safe.objectives import (
+    CRPOLoss,
+    CUPLoss,
+    FOCOPSLoss,
+    IPOLoss,
+    LagrangianLoss,
+    P3OLoss,
+    PPOLagrangianLoss,
+    TrustRegionLoss,
+)
+from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_networks
+
+
+def wrapping(make, parent):
+    """``make`` around ``parent``, as a function of the networks."""
+
+    def build(actor, critic, cost_critic, *, num_costs=1, cost_critic_coeff=1.0, **kwargs):
+        wrapped = parent(actor, critic, **kwargs)
+        return make(wrapped, cost_critic, num_costs=num_costs, cost_critic_coeff=cost_critic_coeff)
+
+    return build
+
+
+SUBCLASSES = {
+    "ppo-lagrangian": (PPOLagrangianLoss, ClipPPOLoss),
+    "focops": (partial(FOCOPSLoss, kl_bound=float("inf"), temperature=1.0), PPOLoss),
+    "cup": (CUPLoss, ClipPPOLoss),
+    "p3o": (P3OLoss, ClipPPOLoss),
+    "ipo": (IPOLoss, ClipPPOLoss),
+    "trust-region": (TrustRegionLoss, PPOLoss),
+    "lagrangian-clip-ppo": (wrapping(LagrangianLoss, ClipPPOLoss), ClipPPOLoss),
+    "lagrangian-kl-ppo": (wrapping(LagrangianLoss, KLPENPPOLoss), KLPENPPOLoss),
+    "crpo-clip-ppo": (wrapping(CRPOLoss, ClipPPOLoss), ClipPPOLoss),
+}
+# These evaluate their policy on a copy of their own: the trunk is evaluated once more.
+OTHERS = {
+    "lagrangian-a2c": (wrapping(LagrangianLoss, A2CLoss), A2CLoss),
+    "lagrangian-reinforce": (wrapping(LagrangianLoss, ReinforceLoss), ReinforceLoss),
+    "crpo-a2c": (wrapping(CRPOLoss, A2CLoss), A2CLoss),
+}
+every_loss = pytest.mark.parametrize(
+    "make", [make for make, _ in SUBCLASSES.values()], ids=SUBCLASSES
+)
+all_losses = pytest.mark.parametrize(
+    "make", [make for make, _ in {**SUBCLASSES, **OTHERS}.values()], ids=[*SUBCLASSES, *OTHERS]
+)
+
+
+# ---------------------------------------------------------------- critics that are heads
+
+
+class Trunk(nn.Linear):
+    calls = 0
+
+    def forward(self, observation):
+        self.calls += 1
+        return super().forward(observation).tanh()
+
+
+def make_heads(num_costs=2, hidden="hidden"):
+    """A trunk, and actor, critic and cost critic on it as TorchRL's documentation has them."""
+    torch.manual_seed(0)
+    trunk = Trunk(OBSERVATION_SIZE, 8)
+    policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
+    value_head = ValueOperator(nn.Linear(8, 1), in_keys=[hidden])
+    model = ActorValueOperator(
+        TensorDictModule(trunk, ["observation"], [hidden]),
+        ProbabilisticActor(
+            TensorDictModule(policy, [hidden], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=IndependentNormal,
+            return_log_prob=True,
+        ),
+        value_head,
+    )
+    cost_head = ValueOperator(nn.Linear(8, num_costs), in_keys=[hidden], out_keys=["cost_value"])
+    return trunk, (model.get_policy_operator(), value_head, cost_head)
+
+
+def minibatch(num_costs=2):
+    """Steps with advantages and targets, and features that an older trunk has left."""
+    torch.manual_seed(2)
+    data = make_batch(num_costs).reshape(-1)
+    shape = data.shape
+    data["advantage"], data["value_target"] = torch.randn(*shape, 1), torch.randn(*shape, 1)
+    data["cost_advantage"] = torch.randn(*shape, num_costs)
+    data["cost_value_target"] = torch.randn(*shape, num_costs)
+    data["hidden"] = torch.full((*shape, 8), 100.0)
+    return data
+
+
+@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
+# A2CLoss and ReinforceLoss want features in the data for their own head.
+@pytest.mark.parametrize(
+    ("make", "features"),
+    [
+        *((make, features) for make, _ in SUBCLASSES.values() for features in ("stale", "absent")),
+        *((make, "stale") for make, _ in OTHERS.values()),
+    ],
+    ids=[
+        *(f"{name}-{features}" for name in SUBCLASSES for features in ("stale", "absent")),
+        *(f"{name}-stale" for name in OTHERS),
+    ],
+)
+def test_a_cost_head_trains_on_the_features_of_this_call(make, features, functional):
+    trunk, (actor, critic, cost_head) = make_heads()
+    head = copy.deepcopy(cost_head)
+    loss = make(actor, critic, cost_head, num_costs=2, functional=functional)
+    data = minibatch()
+    if features == "absent":
+        del data["hidden"]
+    weight = loss.actor_network_params["module", "0", "module", "weight"] if functional else None
+    weight = trunk.weight if weight is None else weight
+    hidden = nn.functional.linear(data["observation"], weight, trunk_bias(loss, trunk)).tanh()
+    value = head.module(hidden)
+    expected = (
+        nn.functional.smooth_l1_loss(value, data["cost_value_target"], reduction="none")
+        .sum(-1)
+        .mean()
+    )
+    actual = loss(data)["loss_cost_critic"]
+    torch.testing.assert_close(actual, expected)
+    (gradient,) = torch.autograd.grad(actual, [weight], retain_graph=True)
+    (wanted,) = torch.autograd.grad(expected, [weight])
+    assert wanted.norm() > 1e-3
+    torch.testing.assert_close(gradient, wanted)
+
+
+def trunk_bias(loss, trunk):
+    if not loss.functional:
+        return trunk.bias
+    return loss.actor_network_params["module", "0", "module", "bias"]
+
+
+@every_loss
+def test_the_trunk_is_evaluated_once_in_a_call(make):
+    trunk, networks = make_heads()
+    loss, data = make(*networks, num_costs=2), minibatch()
+    before = trunk.calls
+    loss(data)
+    once = 2 if isinstance(getattr(loss, "loss_module", None), KLPENPPOLoss) else 1
+    assert trunk.calls - before == once  # KLPENPPOLoss itself evaluates its policy twice.
+
+
+# KLPENPPOLoss moves its coefficient at each call: two calls differ.
+@pytest.mark.parametrize(
+    ("make", "parent"),
+    [pair for pair in SUBCLASSES.values() if pair[1] is not KLPENPPOLoss],
+    ids=[name for name, pair in SUBCLASSES.items() if pair[1] is not KLPENPPOLoss],
+)
+def test_with_heads_and_no_constraint_it_is_its_parent_bit_for_bit(make, parent):
+    loss = make(*make_heads()[1], num_costs=2)
+    free(loss)
+    actor, critic, _ = make_heads()[1]
+    for data in (minibatch(), minibatch().exclude("hidden")):
+        losses, expected = loss(data.clone()), parent(actor, critic)(data.clone())
+        for key, value in expected.items():
+            assert torch.equal(losses[key], value), key
+
+
+@all_losses
+def test_advantages_of_heads_are_estimated_from_features_computed_now(make):
+    """Those of the next state too, which no collector has; and no feature stays in the batch."""
+    networks = make_heads()[1]
+    loss = make(*networks, num_costs=2)
+    batch = make_batch(2)
+    estimated = loss.estimate_advantages(batch.clone())
+    full = batch.clone()
+    actor, critic, cost_head = make_heads()[1]
+    with torch.no_grad():
+        for part in (full, full["next"]):
+            part["hidden"] = actor[0](part.select("observation"))["hidden"]
+            critic(part)
+            cost_head(part)
+    assert set(estimated.keys()) == set(batch.keys()) | {
+        *("advantage", "value_target", "state_value"),
+        *("cost_advantage", "cost_value_target", "cost_value"),
+    }
+    torch.testing.assert_close(estimated["state_value"], full["state_value"])
+    torch.testing.assert_close(estimated["cost_value"], full["cost_value"])
+    done = batch["next", "done"] & batch["next", "terminated"]
+    last = batch["next", "cost"] + 0.99 * full["next", "cost_value"] * ~done
+    # A truncated step's target is what its own next state is worth.
+    torch.testing.assert_close(estimated["cost_value_target"][2, 3], last[2, 3])
+
+
+# tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.slow
+@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
+@pytest.mark.parametrize("name", ["ppo-lagrangian", "p3o", "lagrangian-clip-ppo"])
+def test_heads_compile_to_one_graph(name, functional):
+    loss = SUBCLASSES[name][0](*make_heads()[1], num_costs=2, functional=functional)
+    data, expected = minibatch(), loss(minibatch())
+    torch._dynamo.reset()
+    actual = torch.compile(loss, fullgraph=True, backend="eager")(data)
+    for key, value in expected.items():
+        torch.testing.assert_close(actual[key], value)
+
+
+# ---------------------------------------------------------------- composite actions, compilation
+
+
+@pytest.mark.parametrize("num_costs", [1, 3])
+# KLPENPPOLoss moves its coefficient at each call: two calls differ.
+@pytest.mark.parametrize("name", [name for name in SUBCLASSES if name != "lagrangian-kl-ppo"])
+def test_with_composite_actions_and_no_constraint_it_is_its_parent(name, num_costs):
+    make, parent = SUBCLASSES[name]
+    with set_composite_lp_aggregate(False):
+        actor, critic, cost_critic, batch = make_composite(num_costs)
+        expected_loss = parent(copy.deepcopy(actor), copy.deepcopy(critic))
+        loss = make(actor, critic, cost_critic, num_costs=num_costs)
+        free(loss)
+        data = loss.estimate_advantages(batch).reshape(-1)
+        losses, expected = loss(data), expected_loss(data)
+        heads = losses.pop("composite_entropy") == expected.pop("composite_entropy")
+        assert heads.all()
+        for key, value in expected.items():
+            assert torch.equal(losses[key], value), key
+        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+
+
+def free(loss):
+    """Moves a loss as far from its limits as a number can be."""
+    if "cost_violation" in dict(loss.named_buffers()):
+        loss.cost_violation.fill_(-1e30)
+
+
+# tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.slow
+@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
+# KLPENPPOLoss branches on its divergence, which no graph can.
+@pytest.mark.parametrize("name", [n for n in {**SUBCLASSES, **OTHERS} if n != "lagrangian-kl-ppo"])
+def test_every_loss_compiles_to_one_graph(name, functional):
+    make, _ = {**SUBCLASSES, **OTHERS}[name]
+    loss = make(*make_networks(2), num_costs=2, functional=functional)
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    expected = loss(data)
+    torch._dynamo.reset()
+    actual = torch.compile(loss, fullgraph=True, backend="eager")(data)
+    for key, value in expected.items():
+        torch.testing.assert_close(actual[key], value)
+
+
+# ---------------------------------------------------------------- advantages where there are none
+
+
+@all_losses
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_a_batch_without_advantages_is_treated_like_one_with_them(make, scale):
+    loss = make(*make_networks(2), num_costs=2)
+    buffers = dict(loss.named_buffers())
+    for name in {"lagrange_multiplier", "cost_violation"} & buffers.keys():
+        buffers[name].fill_(1.0)
+    batch = make_batch(2)
+    batch["next", "reward"] *= scale
+    twin = copy.deepcopy(loss)
+    losses, expected = loss(batch.clone()), twin(twin.estimate_advantages(batch))
+    for key, value in expected.items():
+        assert torch.equal(losses[key], value), key
+
+
+def test_the_objective_does_not_depend_on_the_scale_of_rewards():
+    """Without estimate_advantages it was 1000 times as large, and the cost meant nothing in it."""
+    loss = PPOLagrangianLoss(*make_networks(2), num_costs=2, multiplier_init=1.0)
+    plain = loss(make_batch(2))["loss_objective"]
+    batch = make_batch(2)
+    batch["next", "reward"] *= 1000
+    # The critic does not follow the rewards, so that the two are close and not the same.
+    assert (loss(batch)["loss_objective"] - plain).abs() < 0.3
+
+
+def test_an_advantage_norm_scales_the_reward_advantage_instead():
+    class Halve(nn.Module):
+        def scale(self):
+            return torch.tensor(2.0)
+
+        def update(self, value):
+            return None
+
+    loss = PPOLagrangianLoss(*make_networks(2), num_costs=2, advantage_norm=Halve())
+    plain = ClipPPOLoss(*make_networks(2)[:2], advantage_norm=Halve())
+    batch = make_batch(2)
+    assert torch.equal(loss(batch)["loss_objective"], plain(batch)["loss_objective"])
+
+
+# ---------------------------------------------------------------- the wrapped loss
+
+
+def test_coefficients_are_read_and_set_through_the_wrapper():
+    actor, critic, cost_critic = make_networks()
+    loss = LagrangianLoss(KLPENPPOLoss(actor, critic, beta=0.7), cost_critic)
+    assert loss.beta == torch.tensor(0.7)
+    assert loss.entropy_coeff == torch.tensor(0.01)
+    assert loss.critic_coeff == torch.tensor(1.0)
+    loss.beta, loss.entropy_coeff, loss.critic_coeff = 0.5, 0.25, 2.0
+    inner = loss.loss_module
+    assert (inner.entropy_coeff, inner.critic_coeff) == (0.25, 2.0)
+    assert inner.beta == loss.beta == 0.5
+    assert not {"beta", "entropy_coeff", "critic_coeff"} & vars(loss).keys()
+
+
+def test_plain_options_are_set_in_the_wrapped_loss():
+    """It was taken silently, and nothing changed."""
+    actor, critic, cost_critic = make_networks()
+    loss = LagrangianLoss(ClipPPOLoss(actor, critic), cost_critic)
+    data = loss.estimate_advantages(make_batch()).reshape(-1)
+    assert "loss_entropy" in loss(data)
+    loss.entropy_bonus = False
+    assert "loss_entropy" not in loss(data)
+    assert loss.loss_module.entropy_bonus is False
+    loss.log_explained_variance = False
+    assert not any("explained_variance" in key for key in [*loss(data).keys(), *loss.out_keys])
+    loss.reduction = "sum"
+    mean = loss.loss_module(data)
+    assert torch.equal(loss(data)["loss_objective"], mean["loss_objective"])
+    loss.separate_losses = True  # That of the cost critic is its own.
+    assert loss.loss_module.separate_losses is False
+
+
+def test_what_neither_has_is_an_error():
+    actor, critic, cost_critic = make_networks()
+    loss = LagrangianLoss(ClipPPOLoss(actor, critic), cost_critic)
+    with pytest.raises(AttributeError, match="no_such_option"):
+        _ = loss.no_such_option
+
+
+@pytest.mark.parametrize("make", [LagrangianLoss, CRPOLoss])
+def test_soft_update_finds_the_targets_of_the_wrapped_loss(make):
+    actor, critic, cost_critic = make_networks()
+    loss = make(ClipPPOLoss(actor, critic, delay_actor=True), cost_critic)
+    names = list(loss.state_dict())
+    updater = SoftUpdate(loss, eps=0.5)
+    data = loss.estimate_advantages(make_batch()).reshape(-1)
+    loss(data)  # Warns if nobody is said to update the targets: warnings are errors here.
+    before = loss.target_actor_network_params.clone()
+    with torch.no_grad():
+        for parameter in loss.actor_network_params.values(True, True):
+            parameter.add_(1.0)
+    updater.step()
+    for key, value in loss.loss_module.target_actor_network_params.items(True, True):
+        torch.testing.assert_close(value, before[key] + 0.5)
+    assert list(loss.state_dict()) == names
+
+
+def test_a_loss_with_costs_of_its_own_is_not_wrapped():
+    inner = PPOLagrangianLoss(*make_networks())
+    with pytest.raises(ValueError, match="without costs, got PPOLagrangianLoss"):
+        LagrangianLoss(inner, make_networks()[2])
+
+
+# ---------------------------------------------------------------- what a call leaves behind
+
+
+@all_losses
+def test_a_loss_can_be_copied_after_a_call_that_failed(make):
+    loss = make(*make_networks(2), num_costs=2)
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    with pytest.raises(KeyError):
+        loss(data.exclude("cost_value_target"))
+    twin = copy.deepcopy(loss)
+    expected = loss(data.clone())
+    for key, value in twin(data).items():
+        assert torch.equal(value, expected[key]), key
+
+
+@all_losses
+def test_no_call_leaves_a_tensor_of_the_graph_on_the_loss(make):
+    loss = make(*make_networks(2), num_costs=2)
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    loss(data)
+    modules = [loss, *(m for m in loss.children() if isinstance(m, LossModule))]
+    held = [value for module in modules for value in vars(module).values()]
+    assert not [value for value in held if isinstance(value, torch.Tensor | tuple) and value != ()]
+
+
+def test_focops_evaluates_the_policy_once():
+    actor, critic, cost_critic = make_networks()
+    calls = []
+    actor[0].module[0].register_forward_hook(lambda *_: calls.append(1))
+    loss = FOCOPSLoss(actor, critic, cost_critic)
+    data = loss.estimate_advantages(make_batch()).reshape(-1)
+    calls.clear()
+    loss(data)
+    assert len(calls) == 1
+
+
+# ---------------------------------------------------------------- reductions are TorchRL's
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+@pytest.mark.parametrize("key", ["auto", None, "mine"])
+@pytest.mark.parametrize("shape", [(4, 6, 1), (4, 6)], ids=str)
+def test_values_are_reduced_as_torchrl_does(shape, key, reduction):
+    """TorchRL's own is private; this tells when it moves."""
+    loss = ClipPPOLoss(*make_networks()[:2], reduction=reduction)
+    loss.loss_mask_key = key
+    data, values = make_batch(), torch.randn(shape)
+    expected = loss._reduce_loss(values, data)
+    assert torch.equal(reduced(loss, values, data), expected)
+    data["collector", "mask"] = torch.rand(4, 6, 1) > 0.3
+    data["shifted_valid"] = torch.rand(4, 6) > 0.3
+    data["mine"] = torch.rand(4, 6, 1) > 0.3
+    expected = loss._reduce_loss(values, data)
+    assert torch.equal(reduced(loss, values, data), expected)
+
+
+# ---------------------------------------------------------------- what does not fit
+
+
+@pytest.mark.parametrize("make", [P3OLoss, IPOLoss])
+def test_multipliers_are_refused_where_there_are_none(make):
+    with pytest.raises(TypeError, match=r"has no multipliers, got multiplier_init=0\.5"):
+        make(*make_networks(), multiplier_init=0.5)

@@ -1,0 +1,54 @@
+"""Which steps count in a loss, and the mean or sum over them, as TorchRL's losses have it."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import AUTO_LOSS_MASK_KEYS, LossModule
+
+
+def counted(loss: LossModule, tensordict: TensorDictBase, values: Tensor) -> Tensor | None:
+    """The steps that a loss counts, expanded to the shape of the values, or None if all."""
+    key = loss.loss_mask_key
+    keys = AUTO_LOSS_MASK_KEYS if key == "auto" else () if key is None else (key,)
+    found = [tensordict.get(key, None) for key in keys]
+    masks = [expanded_mask(mask, values) for mask in found if mask is not None]
+    return torch.stack(masks).all(0) if masks else None
+
+
+def reduced(
+    loss: LossModule, values: Tensor, tensordict: TensorDictBase, reduction: str | None = None
+) -> Tensor:
+    """The values as the loss reduces its own, over the steps that count.
+
+    Args:
+        loss (LossModule): gives ``loss_mask_key`` and ``reduction``.
+        values (Tensor): one value or more for each step, shape ``(*B, ...)``.
+        tensordict (TensorDictBase): the data, with the masks.
+        reduction (str, optional): ``"mean"``, ``"sum"`` or ``"none"``. Defaults to the loss's.
+
+    Returns:
+        A number, or with ``"none"`` the values, 0 where they do not count.
+    """
+    reduction = loss.reduction if reduction is None else reduction
+    mask = counted(loss, tensordict, values)
+    if mask is not None:  # Not multiplied: what does not count may be NaN.
+        values = torch.where(mask, values, torch.zeros_like(values))
+    if reduction == "none":
+        return values
+    if reduction == "sum":
+        return values.sum()
+    return values.mean() if mask is None else values.sum() / mask.sum().clamp_min(1)
+
+
+def expanded_mask(mask: Tensor, values: Tensor) -> Tensor:
+    """A mask of steps in the shape of the values, a last dimension of 1 more or less."""
+    while mask.ndim > values.ndim and mask.shape[-1] == 1:
+        mask = mask.squeeze(-1)
+    if mask.ndim > values.ndim:
+        raise ValueError(
+            f"A mask of shape {tuple(mask.shape)} does not fit values of shape "
+            f"{tuple(values.shape)}."
+        )
+    return mask.reshape(*mask.shape, *(1,) * (values.ndim - mask.ndim)).expand_as(values)

@@ -1,0 +1,1 @@
+"""Losses of on-policy data, and the one way to constrain them."""

@@ -1,0 +1,201 @@
+"""How every on-policy loss is put under constraints: its advantages, one method, its critics."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    dispatch,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.objectives import PPOLoss
+
+from torchrl_safe.objectives.critics.cost_critic import CostCritic, CostKeys
+from torchrl_safe.objectives.critics.cost_values import (
+    get_or_raise,
+    initial_multiplier,
+    report_each,
+)
+
+
+class ConstrainedLoss(CostCritic):
+    """A loss of TorchRL for the policy, under constraints on k costs.
+
+    A subclass writes :meth:`policy_losses`: the method, as its paper has it. There it calls
+    ``unconstrained(tensordict, advantage)``, TorchRL's own loss for an advantage, which the class
+    beside this one brings: :class:`ConstrainedPPO` for a parent, ``WrappedLoss`` for an object.
+    """
+
+    # What tells the loss of its constraints: buffers of shape (k,) that an updater writes. Each
+    # call reports them.
+    cost_buffers: ClassVar[tuple[str, ...]] = ("lagrange_multiplier",)
+    # What policy_losses returns beside the outputs of the unconstrained loss.
+    policy_out_keys: ClassVar[tuple[str, ...]] = ()
+
+    _schedulable_buffers = frozenset({"lagrange_multiplier"})
+
+    lagrange_multiplier: Tensor
+    cost_violation: Tensor
+
+    def __init__(self, *args: Any, multiplier_init: float | Tensor = 0.0, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        multiplier = initial_multiplier(self.num_costs, multiplier_init)
+        if multiplier.any() and "lagrange_multiplier" not in self.cost_buffers:
+            raise TypeError(
+                f"{type(self).__name__} has no multipliers, got multiplier_init={multiplier_init}."
+            )
+        for name in self.cost_buffers:
+            start = multiplier if name == "lagrange_multiplier" else torch.zeros_like(multiplier)
+            self.register_buffer(name, start.to(self.cost_critic_coeff.device))
+
+    @abc.abstractmethod
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        """All outputs but those of the cost critic.
+
+        Args:
+            tensordict (TensorDictBase): the data, a copy that may be written to.
+            advantage (Tensor): reward advantage, shape ``(*B, 1)``.
+            cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
+
+        Returns:
+            A tensordict of losses named ``"loss_..."``, reduced, and of numbers to log.
+        """
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = tensordict.clone(False)
+        advantage, cost_advantage = self._advantages(tensordict)
+        losses = self.policy_losses(tensordict, advantage, cost_advantage)
+        self._set_cost_critic_outputs(losses, tensordict)
+        for name in self.cost_buffers:
+            report_each(losses, name, getattr(self, name))
+        return losses
+
+    def _advantages(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        if not self._has_advantages(tensordict):
+            self._estimate_advantages(tensordict)
+        cost_advantage = tensordict.get(self.tensor_keys.cost_advantage)
+        self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
+        return tensordict.get(self.tensor_keys.advantage), cost_advantage
+
+    def _own_out_keys(self) -> list[NestedKey]:
+        reported = [f"{name}_{i}" for name in self.cost_buffers for i in range(self.num_costs)]
+        return [*self.policy_out_keys, *super()._own_out_keys(), *reported]
+
+
+class Policy(NamedTuple):
+    """The policy in the states of a batch: evaluated once for all that a loss asks of it.
+
+    ``log_ratio`` is the logarithm of the ratio that PPO clips, to the proximal policy, and
+    ``log_correction`` what makes it that to the policy that collected the batch, or ``None`` if
+    these two are one (see ``delay_actor`` and ``max_importance_ratio`` of TorchRL's losses). Both
+    have shape ``(*B, 1)``.
+    """
+
+    log_ratio: Tensor
+    distribution: Distribution
+    kl_approx: Tensor
+    log_correction: Tensor | None
+
+    def ratio(self) -> Tensor:
+        """Ratio to the policy that collected the batch, shape ``(*B, 1)``."""
+        if self.log_correction is None:
+            return self.log_ratio.exp()
+        return (self.log_ratio + self.log_correction).exp()
+
+
+@dataclass
+class PPOKeys(CostKeys, PPOLoss._AcceptedKeys):
+    """The keys of the costs and those of PPO."""
+
+
+class ConstrainedPPO(ConstrainedLoss):
+    """Puts a parent under constraints: :class:`~torchrl.objectives.PPOLoss` or one made of it.
+
+    It stands before that parent among the bases: ``class Mine(ConstrainedPPO, ClipPPOLoss)``.
+    """
+
+    _AcceptedKeys = PPOKeys
+    default_keys = PPOKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        cost_critic_network: TensorDictModuleBase,
+        *,
+        num_costs: int = 1,
+        multiplier_init: float | Tensor = 0.0,
+        cost_critic_coeff: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            critic_network,
+            cost_critic_network=cost_critic_network,
+            num_costs=num_costs,
+            multiplier_init=multiplier_init,
+            cost_critic_coeff=cost_critic_coeff,
+            **kwargs,
+        )
+
+    def evaluate(self, tensordict: TensorDictBase) -> Policy:
+        """The present policy. What its modules write stays in the data, where heads find it."""
+        cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
+        return evaluate(self, tensordict, cost_advantage.shape[:-1])
+
+    def unconstrained(
+        self, tensordict: TensorDictBase, advantage: Tensor, policy: Policy | None = None
+    ) -> TensorDictBase:
+        """The parent's outputs, for this advantage of shape ``(*B, 1)``."""
+        policy = self.evaluate(tensordict) if policy is None else policy
+        tensordict = tensordict.set(self.tensor_keys.advantage, advantage)
+        return self.parent_forward(_Evaluated(self, policy), tensordict)
+
+    def _advantages(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        estimated = not self._has_advantages(tensordict)
+        advantage, cost_advantage = super()._advantages(tensordict)
+        # normalize_advantage and advantage_norm are about the reward. The parent applies them
+        # within its forward only, where the costs are mixed in already.
+        advantage = self._maybe_normalize_advantage(advantage, tensordict, update_norm=estimated)
+        return advantage, cost_advantage
+
+
+class _Evaluated:
+    """What TorchRL's forward gets as ``self``: the loss, with policy and advantage ready."""
+
+    def __init__(self, loss: PPOLoss, policy: Policy) -> None:
+        self._loss = loss
+        self._policy = policy
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loss, name)
+
+    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> Policy:
+        return self._policy
+
+    def _maybe_normalize_advantage(
+        self, advantage: Tensor, tensordict: TensorDictBase, *, update_norm: bool
+    ) -> Tensor:
+        return advantage
+
+
+def evaluate(loss: PPOLoss, tensordict: TensorDictBase, shape: torch.Size) -> Policy:
+    """The present policy of a PPO loss; ``shape`` is that of the states."""
+    # TorchRL's one place for composite actions, the proximal policy and the cap of the ratio.
+    return Policy(*loss._log_weight(tensordict, adv_shape=shape))
+
+
+def forward_evaluated(loss: PPOLoss, tensordict: TensorDictBase, policy: Policy) -> TensorDictBase:
+    """The loss's own forward, with a policy that has been evaluated already."""
+    return type(loss).forward(_Evaluated(loss, policy), tensordict)

@@ -1,0 +1,155 @@
+"""Constraint-rectified policy optimization: either the reward, or one cost that is too high."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_safe.objectives._checks import check_number
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedLoss
+from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
+
+
+def rectified_advantage(
+    advantage: Tensor, cost_advantage: Tensor, violation: Tensor, tolerance: Tensor | float
+) -> Tensor:
+    r"""The reward advantage while every limit is kept, else that of lowering the worst cost.
+
+    .. math::
+        A = \begin{cases}
+            A_r & \text{if } J_{c_i} \le d_i + \eta \text{ for all } i \\
+            -A_{c_j} & \text{otherwise, with } j = \arg\max_i (J_{c_i} - d_i)
+        \end{cases}
+
+    (Xu, Liang, Lan 2021, https://arxiv.org/abs/2011.05869, algorithm 1, which leaves open which
+    of several violated limits j is.)
+
+    Args:
+        advantage (Tensor): reward advantage, shape ``(*B, 1)``.
+        cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
+        violation (Tensor): mean episode cost minus limit, shape ``(k,)``.
+        tolerance (Tensor or float): the margin :math:`\eta`, in the unit of the episode cost.
+
+    Returns:
+        The advantage to maximize, shape ``(*B, 1)``.
+
+    Raises:
+        ValueError: if the three shapes do not fit together.
+
+    Examples:
+        >>> import torch
+        >>> reward, cost = torch.tensor([[1.0], [2.0]]), torch.tensor([[3.0, 4.0], [5.0, 6.0]])
+        >>> rectified_advantage(reward, cost, torch.tensor([-1.0, 0.1]), tolerance=0.2)
+        tensor([[1.],
+                [2.]])
+        >>> rectified_advantage(reward, cost, torch.tensor([-1.0, 0.3]), tolerance=0.2)
+        tensor([[-4.],
+                [-6.]])
+    """
+    if cost_advantage.shape[-1:] != violation.shape:
+        raise ValueError(
+            "cost_advantage must have one column for each violation, got cost_advantage of shape "
+            f"{tuple(cost_advantage.shape)} and violation of shape {tuple(violation.shape)}."
+        )
+    if advantage.shape != (*cost_advantage.shape[:-1], 1):
+        raise ValueError(
+            "advantage must have shape (*B, 1) and cost_advantage (*B, k) with the same *B, got "
+            f"{tuple(advantage.shape)} and {tuple(cost_advantage.shape)}."
+        )
+    worst = cost_advantage.index_select(-1, violation.argmax().reshape(1))
+    return torch.where(violation.max() > tolerance, -worst, advantage)
+
+
+class CRPOLoss(ConstrainedLoss, WrappedLoss):
+    r"""Gives an advantage loss the reward, or the cost whose limit is exceeded most.
+
+    Presented in "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
+    Guarantee", Xu, Liang, Lan 2021 (https://arxiv.org/abs/2011.05869). There is no multiplier: as
+    long as every mean episode cost is within its limit and a tolerance, the loss is the wrapped
+    one, bit for bit; else its advantage is that of :func:`rectified_advantage`. A
+    :class:`~torchrl_safe.objectives.ViolationUpdater` brings the violations, once for each
+    collected batch. The cost then swings about ``cost_limit + tolerance``: the paper takes the
+    policy of a random one of the steps that maximized the reward.
+
+    The paper takes natural-gradient steps on the advantage; here the wrapped loss decides:
+    :class:`~torchrl.objectives.ClipPPOLoss`, :class:`~torchrl.objectives.A2CLoss` and all others
+    that :class:`~torchrl_safe.objectives.LagrangianLoss` takes.
+
+    Args:
+        loss_module (LossModule): the loss to constrain. Its ``reduction``, ``clip_value``,
+            ``loss_critic_type`` and masks hold for the cost critic too.
+        cost_critic_network (TensorDictModule): value operator of the costs, writes
+            ``"cost_value"`` of shape ``(*B, k)``.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs. Defaults to ``1``.
+        tolerance (float, optional): how far a limit may be exceeded, in the unit of the episode
+            cost. Defaults to ``0.0``.
+        cost_critic_coeff (float, optional): weight of the cost critic's loss.
+            Defaults to ``1.0``.
+        separate_losses (bool, optional): leave parameters that the cost critic shares with the
+            policy out of the cost critic's loss. Defaults to ``False``.
+
+    Raises:
+        TypeError: if ``separate_losses`` is not a bool.
+        ValueError: if ``loss_module`` reads no advantage or normalizes the one it is given, or
+            ``num_costs`` or ``tolerance`` is not usable; in a call, if the cost critic or the
+            costs have another width than ``num_costs``.
+
+    :meth:`set_keys` takes the keys of the wrapped loss, and of shape ``(*B, k)``: ``cost`` (read
+    under ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
+
+    Outputs beside those of the wrapped loss: ``loss_cost_critic``, ``cost_explained_variance``
+    (mean over the costs) and ``cost_violation_0`` ... ``cost_violation_{k-1}``, and with
+    ``clip_value`` also ``cost_value_clip_fraction``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.objectives import ClipPPOLoss
+        >>> from torchrl_safe.objectives import ViolationUpdater
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> actor, critic, cost_critic = make_networks(num_costs=2)
+        >>> loss = CRPOLoss(ClipPPOLoss(actor, critic), cost_critic, num_costs=2)
+        >>> updater = ViolationUpdater(loss, cost_limit=torch.tensor([1.0, 5.0]))
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))  # a row for each episode
+        >>> losses = loss(loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1))
+        >>> losses["cost_violation_0"], losses["cost_violation_1"]
+        (tensor(2.), tensor(-4.5000))
+    """
+
+    _schedulable_buffers = frozenset({"tolerance"})
+
+    cost_buffers = ("cost_violation",)
+
+    tolerance: Tensor
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        cost_critic_network: TensorDictModuleBase,
+        *,
+        num_costs: int = 1,
+        tolerance: float = 0.0,
+        cost_critic_coeff: float = 1.0,
+        separate_losses: bool = False,
+    ) -> None:
+        super().__init__(
+            loss_module,
+            cost_critic_network=cost_critic_network,
+            num_costs=num_costs,
+            cost_critic_coeff=cost_critic_coeff,
+            separate_losses=separate_losses,
+        )
+        tolerance = check_number("tolerance", tolerance)
+        self.register_coeff_buffer("tolerance", tolerance, device=self.cost_critic_coeff.device)
+
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        rectified = rectified_advantage(
+            advantage, cost_advantage, self.cost_violation, self.tolerance
+        )
+        return self.unconstrained(tensordict, rectified)

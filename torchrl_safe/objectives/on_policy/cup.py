@@ -1,0 +1,210 @@
+"""Constrained update projection: improve the policy, then project it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictParams,
+)
+from torch import Tensor
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE, ValueEstimatorBase
+
+from torchrl_safe.objectives._checks import check_discount
+from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.critics.cost_values import get_or_raise
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
+from torchrl_safe.objectives.on_policy.policies import divergence
+
+
+def projection_objective(
+    kl: Tensor,
+    ratio: Tensor,
+    cost_advantage: Tensor,
+    lagrange_multiplier: Tensor,
+    scale: Tensor | float,
+) -> Tensor:
+    r"""CUP's projection: stay near the improved policy, and cost less.
+
+    .. math::
+        D_{KL}(\pi_\theta \| \pi_{k + 1/2}) + s \sum_i \nu_i \, r A_{c_i}
+
+    (Yang et al. 2022, https://arxiv.org/abs/2209.07089, with
+    :math:`s = (1 - \gamma \lambda) / (1 - \gamma)`.)
+
+    Args:
+        kl (Tensor): divergence from the improved policy, shape ``(*B, 1)``.
+        ratio (Tensor): ratio r to the policy that collected the batch, shape ``(*B, 1)``.
+        cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
+        lagrange_multiplier (Tensor): non-negative multipliers, shape ``(k,)``.
+        scale (Tensor or float): the factor s, which makes up for the trace decay of GAE.
+
+    Returns:
+        The objective, to be minimized, shape ``(*B, 1)``.
+
+    Raises:
+        ValueError: if there is not one advantage for each multiplier.
+    """
+    if cost_advantage.shape[-1:] != lagrange_multiplier.shape:
+        raise ValueError(
+            "cost_advantage must have one column for each multiplier, got cost_advantage of shape "
+            f"{tuple(cost_advantage.shape)} and lagrange_multiplier of shape "
+            f"{tuple(lagrange_multiplier.shape)}."
+        )
+    cost = (lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
+    return kl + scale * ratio * cost
+
+
+class CUPLoss(ConstrainedPPO, ClipPPOLoss):
+    r"""Improves the policy with clipped PPO, then projects it towards the limits of k costs.
+
+    Presented in "Constrained Update Projection Approach to Safe Policy Optimization", Yang et al.
+    2022 (https://arxiv.org/abs/2209.07089). A batch is gone through in two phases, each of as many
+    epochs as one likes:
+
+    1. *improvement*: a call of the loss is :class:`~torchrl.objectives.ClipPPOLoss` on the reward,
+       bit for bit, beside the loss of the cost critic;
+    2. *projection*: :meth:`start_projection`, once, keeps the policy that this has led to,
+       :math:`\pi_{k + 1/2}`; then :meth:`projection_loss` takes the place of the call.
+
+    ``lagrange_multiplier``, the paper's :math:`\nu`, is a buffer of shape ``(k,)`` that a
+    :class:`~torchrl_safe.objectives.MultiplierUpdater` moves, once for each collected batch; the
+    paper's is :class:`~torchrl_safe.objectives.DualAscent`. It acts in the projection only.
+
+    The divergence is :math:`D_{KL}(\pi_\theta \| \pi_{k + 1/2})`, as in the authors' code
+    (OmniSafe), and must be one that :func:`torch.distributions.kl_divergence` knows, of each part
+    of a composite action.
+
+    Args:
+        actor_network (ProbabilisticTensorDictSequential): policy operator.
+        critic_network (TensorDictModule): value operator of the reward, writes
+            ``"state_value"`` of shape ``(*B, 1)``.
+        cost_critic_network (TensorDictModule): value operator of the costs, writes
+            ``"cost_value"`` of shape ``(*B, k)``.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs. Defaults to ``1``.
+        multiplier_init (float or Tensor, optional): multiplier to start with, one number or k.
+            Defaults to ``0.0``.
+        cost_critic_coeff (float, optional): weight of the cost critic's loss.
+            Defaults to ``1.0``.
+        **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
+
+    Raises:
+        ValueError: if ``num_costs`` or ``multiplier_init`` is not usable, or the discount of the
+            costs is 1; in a call, if the cost critic or the costs have another width than
+            ``num_costs``.
+
+    Keys beside those of ``ClipPPOLoss``, all of shape ``(*B, k)``: ``cost`` (read under
+    ``"next"``), ``cost_value``, ``cost_advantage``, ``cost_value_target``.
+
+    Outputs beside those of ``ClipPPOLoss``: ``loss_cost_critic``, ``cost_explained_variance``
+    (mean over the costs), ``lagrange_multiplier_0`` ... ``lagrange_multiplier_{k-1}``, and with
+    ``clip_value`` also ``cost_value_clip_fraction``. Outputs of the projection:
+    ``loss_projection`` and ``kl``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives import DualAscent
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> loss = CUPLoss(*make_networks(num_costs=2), num_costs=2)
+        >>> updater = DualAscent(loss, cost_limit=torch.tensor([1.0, 5.0]), lr=0.01)
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 1.0]]))  # a row for each episode
+        >>> data = loss.estimate_advantages(make_batch(num_costs=2)).reshape(-1)
+        >>> losses = loss(data)  # The first phase: some epochs of these,
+        >>> loss.start_projection()
+        >>> projection = loss.projection_loss(data)  # then some of these.
+        >>> sorted(projection.keys()), projection["kl"]
+        (['kl', 'loss_projection'], tensor(0.))
+    """
+
+    improved_actor_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        cost_critic_network: TensorDictModuleBase,
+        *,
+        num_costs: int = 1,
+        multiplier_init: float | Tensor = 0.0,
+        cost_critic_coeff: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            critic_network,
+            cost_critic_network,
+            num_costs=num_costs,
+            multiplier_init=multiplier_init,
+            cost_critic_coeff=cost_critic_coeff,
+            **kwargs,
+        )
+        self.improved_actor_params = TensorDictParams(
+            self._actor_params().data.clone(), no_convert=True
+        )
+
+    def _actor_params(self) -> TensorDictBase:
+        if self.functional:
+            return self.actor_network_params
+        return TensorDict.from_module(self.actor_network)
+
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        return self.unconstrained(tensordict, advantage)
+
+    def start_projection(self) -> None:
+        """Keeps the policy as it is now, for :meth:`projection_loss` to stay near it."""
+        self.improved_actor_params.data.update_(self._actor_params().data)
+
+    def projection_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Loss of the second phase. It trains the policy alone.
+
+        Args:
+            tensordict (TensorDictBase): data of the batch that the first phase has learned from,
+                with its ``cost_advantage``.
+
+        Returns:
+            A tensordict with ``loss_projection`` (see :func:`projection_objective`), reduced like
+            the other losses, and ``kl``, the mean divergence from the improved policy.
+
+        Raises:
+            KeyError: if the data have no ``cost_advantage``.
+            ValueError: if the costs have another width than ``num_costs``.
+        """
+        tensordict = tensordict.clone(False)
+        cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
+        improved = self._improved_policy(tensordict)
+        policy = self.evaluate(tensordict)
+        kl = divergence(policy.distribution, improved).unsqueeze(-1)
+        objective = projection_objective(
+            kl, policy.ratio(), cost_advantage, self.lagrange_multiplier, self._cost_scale()
+        )
+        return TensorDict(
+            loss_projection=reduced(self, objective, tensordict).squeeze(-1),
+            kl=reduced(self, kl.detach(), tensordict, reduction="mean"),
+        )
+
+    @torch.no_grad()
+    def _improved_policy(self, tensordict: TensorDictBase) -> torch.distributions.Distribution:
+        inputs = tensordict.select(*self.actor_network.in_keys)
+        with self.improved_actor_params.to_module(self.actor_network, preserve_module_state=False):
+            return self.actor_network.get_dist(inputs)
+
+    def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
+        if not isinstance(estimator, GAE):
+            raise ValueError(
+                "estimator must be a GAE, whose trace decay the projection needs, got "
+                f"{type(estimator).__name__}."
+            )
+        check_discount(estimator.gamma)
+
+    def _cost_scale(self) -> Tensor:
+        estimator = self.cost_value_estimator
+        return (1 - estimator.gamma * estimator.lmbda) / (1 - estimator.gamma)

@@ -1,0 +1,78 @@
+"""The clipped surrogate of the costs, for losses that penalize it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives.value import ValueEstimatorBase
+
+from torchrl_safe.objectives._checks import check_episode_length, check_length_known
+from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO, Policy
+
+
+def clipped_cost_surrogate(
+    log_weight: Tensor,
+    cost_advantage: Tensor,
+    bounds: tuple[Tensor, Tensor],
+    log_is_weight: Tensor | float = 0.0,
+) -> Tensor:
+    r"""PPO's surrogate with the sign of a cost, the larger of two products, from where it starts.
+
+    .. math::
+        \max(r A_c,\ \mathrm{clip}(r) A_c) - A_c
+
+    The last term has mean zero over the batch that was collected, not over a minibatch. Left in,
+    the noise of its mean there would be taken for a change of the policy, and a convex penalty
+    makes that a bias.
+
+    Args:
+        log_weight (Tensor): logarithm of the ratio r that is clipped, shape ``(*B, 1)``.
+        cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
+        bounds (tuple of Tensor): logarithms of the smallest and the largest clipped ratio.
+        log_is_weight (Tensor or float, optional): logarithm of what both products are weighted
+            by, shape ``(*B, 1)``. Defaults to ``0.0``.
+
+    Returns:
+        The surrogate of each sample and cost, shape ``(*B, k)``.
+    """
+    ratio, clipped = log_weight.exp(), log_weight.clamp(*bounds).exp()
+    products = torch.maximum(ratio * cost_advantage, clipped * cost_advantage)
+    return torch.as_tensor(log_is_weight).exp() * (products - cost_advantage)
+
+
+class CostSurrogate(ConstrainedPPO):
+    """Brings the mean surrogates of the costs to a loss that penalizes them."""
+
+    cost_buffers = ("cost_violation",)
+    policy_out_keys = ("loss_penalty",)
+
+    def __init__(self, *args: Any, episode_length: float | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.episode_length = check_episode_length(episode_length)
+        if self.reduction != "mean":
+            raise ValueError(
+                "reduction must be 'mean', since the penalty is a function of the batch mean, got "
+                f"{self.reduction!r}."
+            )
+        self._asymmetric = isinstance(kwargs.get("clip_epsilon"), tuple | list)
+
+    def cost_surrogate(
+        self, tensordict: TensorDictBase, policy: Policy, cost_advantage: Tensor
+    ) -> Tensor:
+        """Mean of :func:`clipped_cost_surrogate` for each cost, shape ``(k,)``."""
+        low = self.clip_epsilon_low if self._asymmetric else self.clip_epsilon
+        high = self.clip_epsilon_high if self._asymmetric else self.clip_epsilon
+        surrogate = clipped_cost_surrogate(
+            policy.log_ratio,
+            cost_advantage,
+            ((-low).log1p(), high.log1p()),
+            0.0 if policy.log_correction is None else policy.log_correction,
+        )
+        return torch.stack([reduced(self, column, tensordict) for column in surrogate.unbind(-1)])
+
+    def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
+        check_length_known(self.episode_length, estimator.gamma)

@@ -1,0 +1,1 @@
+"""What moves multipliers and tells losses of violations, once for each batch."""

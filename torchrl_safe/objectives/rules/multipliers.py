@@ -1,0 +1,241 @@
+"""Rules that move the Lagrange multipliers of a loss."""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions.transforms import Transform, identity_transform
+from torchrl.objectives import LossModule
+
+from torchrl_safe.objectives._checks import as_number, check_number
+from torchrl_safe.objectives.rules.cost_updater import CostUpdater
+
+
+class MultiplierUpdater(CostUpdater):
+    """Moves the multipliers of a loss towards its cost limits, once for each collected batch.
+
+    A rule is one method, :meth:`next_multiplier`; checking the costs, projecting on
+    ``[0, max_multiplier]`` and writing the buffer in place happen here, in the manner of
+    ``SoftUpdate(loss).step()``. A multiplier lives in the ``lagrange_multiplier`` buffer of the
+    loss and nowhere else.
+
+    Args:
+        loss_module (LossModule): a loss with a ``lagrange_multiplier`` buffer of shape ``(k,)``.
+
+    Keyword Args:
+        cost_limit (float, Tensor or Mapping): limit of each expected episode cost, one number,
+            k, or one by name, ``{"collision": 0.5, "speed": 2.0}``, in the unit of the
+            undiscounted episode cost.
+        max_multiplier (float, optional): upper bound of every multiplier. Defaults to no bound.
+        pessimism (float, optional): standard errors of the batch's mean episode cost that are
+            added to it. A limit that binds is otherwise met on average only: policies end above
+            it as often as below. Few or uneven episodes are trusted less; a batch of one
+            episode has no standard error, and adds none. Defaults to ``0.0``.
+        normalize (bool, optional): divide the violation by what the costs are like: by the
+            larger of mean and limit, times the largest of mean, standard deviation and limit;
+            the largest of all batches so far, of which each new one forgets a tenth. Costs in
+            another unit, multiplied by ten say, then give a tenth of the multiplier and (with a
+            step that is proportional to the violation) change nothing else, and an early policy
+            that violates the limit a hundred times over does not throw the multiplier out of
+            reach. For costs that are never negative. Defaults to ``False``.
+        cost_names (sequence of str, optional): names of the k costs in their order, for example
+            ``env.cost_names``: those of limits by name, and those that errors and logs use.
+            Defaults to ``("0", "1", ...)``.
+
+    Raises:
+        ValueError: if the loss has no such buffer, or a limit, bound or pessimism is not usable.
+
+    Examples:
+        >>> import torch
+        >>> class Exponentiated(MultiplierUpdater):
+        ...     def next_multiplier(self, multiplier, violation):
+        ...         # By a factor of 1.2 at most. The lower bound lets it start from 0.
+        ...         step = 0.2 * (violation / self.cost_limit).clamp(-1, 1)
+        ...         return multiplier.clamp_min(0.01) * step.exp()
+        >>> loss = LossModule()
+        >>> loss.register_buffer("lagrange_multiplier", torch.zeros(1))
+        >>> updater = Exponentiated(loss, cost_limit=2.0, max_multiplier=10.0)
+        >>> for _ in range(5):
+        ...     updater.step(torch.tensor([[30.0]]))
+        >>> loss.lagrange_multiplier
+        tensor([0.0272])
+    """
+
+    buffer_name = "lagrange_multiplier"
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        *,
+        cost_limit: float | Tensor | Mapping[str, float],
+        max_multiplier: float | None = None,
+        pessimism: float = 0.0,
+        normalize: bool = False,
+        cost_names: Sequence[str] | None = None,
+    ) -> None:
+        super().__init__(
+            loss_module, cost_limit=cost_limit, pessimism=pessimism, cost_names=cost_names
+        )
+        if max_multiplier is not None and as_number(max_multiplier) != math.inf:
+            max_multiplier = check_number("max_multiplier", max_multiplier, positive=True)
+        if not isinstance(normalize, bool):
+            raise TypeError(f"normalize must be a bool, got {normalize!r}.")
+        if normalize and (self.cost_limit < 0).any():
+            raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
+        self.max_multiplier = max_multiplier
+        self.normalize = normalize
+        # The largest so far, slowly forgotten.
+        self.cost_scale = torch.zeros_like(self.cost_limit)
+
+    def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
+        violation, cost_scale = self._violation(episode_cost), self.cost_scale
+        if self.normalize:
+            current, past = self._scale_of(episode_cost), cost_scale.to(episode_cost)
+            # Not of this batch alone: one with few costs would count for more than one with many,
+            # and rare costs would exceed the limit on average.
+            scale = torch.maximum(current, past)
+            violation = torch.where(scale > 0, violation / scale, 0.0)
+            cost_scale = torch.maximum(current, past.lerp(current, 0.1))
+        proposal = self.next_multiplier(buffer, violation)
+        # A proposal of infinity is one beyond the bound, if there is one.
+        projected = proposal.clamp(0, self.max_multiplier)
+        if projected.shape != buffer.shape or not projected.isfinite().all():
+            raise ValueError(
+                f"next_multiplier must return {len(buffer)} finite numbers, got {proposal}."
+            )
+        buffer.copy_(projected)
+        self.cost_scale = cost_scale
+
+    def _scale_of(self, episode_cost: Tensor) -> Tensor:
+        limit = self.cost_limit.to(episode_cost)
+        mean = episode_cost.mean(0)
+        deviation = episode_cost.std(0) if len(episode_cost) > 1 else mean
+        scale = torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
+        # An infinite scale would never be forgotten.
+        return scale.clamp_max(torch.finfo(scale.dtype).max)
+
+    @abc.abstractmethod
+    def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
+        """Proposes the next multipliers; ``step`` projects them on ``[0, max_multiplier]``.
+
+        Args:
+            multiplier (Tensor): current multipliers, shape ``(k,)``. Not to be changed.
+            violation (Tensor): mean episode cost minus limit, shape ``(k,)``, with ``pessimism``
+                and ``normalize`` as they were chosen.
+
+        Returns:
+            The proposed multipliers, shape ``(k,)``.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            **super().state_dict(),
+            "max_multiplier": self.max_multiplier,
+            "normalize": self.normalize,
+            "cost_scale": self.cost_scale.clone(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self.max_multiplier = state_dict["max_multiplier"]
+        self.normalize = state_dict["normalize"]
+        self.cost_scale = state_dict["cost_scale"].clone()
+
+
+class DualAscent(MultiplierUpdater):
+    r"""Projected gradient ascent on the dual: the step is proportional to the violation.
+
+    .. math::
+        \lambda \leftarrow \mathrm{clip}(\lambda + \mathrm{lr} \, (J_c - d),\ 0,\ \mathrm{max})
+
+    ``optimizer`` and ``parametrization`` give the published variants: Adam on the raw
+    multiplier (OmniSafe, SafePO), Adam on a softplus parameter (Safety Gym: Ray et al. 2019).
+    Adam's step is about ``lr`` whatever the size of the violation.
+
+    Args:
+        loss_module (LossModule): see :class:`MultiplierUpdater`.
+
+    Keyword Args:
+        cost_limit (float, Tensor or Mapping): see :class:`MultiplierUpdater`.
+        lr (float): step size, in multiplier per unit of violated cost.
+        max_multiplier (float, optional): see :class:`MultiplierUpdater`.
+        pessimism (float, optional): see :class:`MultiplierUpdater`.
+        normalize (bool, optional): see :class:`MultiplierUpdater`. ``lr`` is then in multiplier
+            times standard deviation of the episode cost.
+        optimizer (callable, optional): called as ``optimizer([parameter], lr=lr)``.
+            Defaults to :class:`torch.optim.SGD`.
+        parametrization (Transform, optional): the multiplier as a function of the parameter
+            that the gradient step acts on, for example
+            ``torch.distributions.transforms.SoftplusTransform()``. As published, the gradient
+            is that of the parameter times the violation, without the transform's derivative.
+            Defaults to the identity: the multiplier itself.
+        cost_names (sequence of str, optional): see :class:`MultiplierUpdater`.
+
+    Raises:
+        ValueError: if ``lr`` is not positive, or ``parametrization`` cannot give the multiplier
+            to start with.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.objectives import LossModule
+        >>> loss = LossModule()
+        >>> loss.register_buffer("lagrange_multiplier", torch.zeros(2))
+        >>> limits = {"collision": 1.0, "speed": 5.0}
+        >>> updater = DualAscent(loss, cost_limit=limits, cost_names=["collision", "speed"], lr=0.5)
+        >>> updater.step(torch.tensor([[2.0, 0.0], [4.0, 0.0]]))
+        >>> loss.lagrange_multiplier
+        tensor([1., 0.])
+    """
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        *,
+        cost_limit: float | Tensor | Mapping[str, float],
+        lr: float,
+        max_multiplier: float | None = None,
+        pessimism: float = 0.0,
+        normalize: bool = False,
+        optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.SGD,
+        parametrization: Transform = identity_transform,
+        cost_names: Sequence[str] | None = None,
+    ) -> None:
+        super().__init__(
+            loss_module,
+            cost_limit=cost_limit,
+            max_multiplier=max_multiplier,
+            pessimism=pessimism,
+            normalize=normalize,
+            cost_names=cost_names,
+        )
+        lr = check_number("lr", lr, positive=True)
+        multiplier = loss_module.lagrange_multiplier
+        if not parametrization.inv(multiplier).isfinite().all():
+            raise ValueError(
+                f"parametrization {parametrization} cannot give the multiplier to start with, "
+                f"{multiplier.tolist()}."
+            )
+        self.parametrization = parametrization
+        self._parameter = torch.zeros_like(multiplier)
+        self.optimizer = optimizer([self._parameter], lr=lr)
+
+    def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
+        # The buffer is the only home of the multiplier: the parameter is read from it each time,
+        # so that a loaded or assigned multiplier is never overwritten by a stale one. The bound
+        # lets a softplus that has underflowed to zero come back.
+        self._parameter.copy_(self.parametrization.inv(multiplier).clamp_min(-80))
+        self._parameter.grad = -violation.to(self._parameter)
+        self.optimizer.step()
+        return self.parametrization(self._parameter).to(multiplier)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self.optimizer.load_state_dict(state_dict["optimizer"])

@@ -1,0 +1,150 @@
+"""The multiplier rule that also reacts to how large a violation is and how fast it grows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_safe.objectives._checks import as_number, check_number
+from torchrl_safe.objectives.rules.multipliers import MultiplierUpdater
+
+
+class PIDControl(MultiplierUpdater):
+    r"""Proportional, integral and derivative control of the multipliers.
+
+    Presented in "Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", Stooke,
+    Achiam, Abbeel 2020 (https://arxiv.org/abs/2007.03964), algorithm 2. With the mean episode
+    cost :math:`J`, its moving average :math:`\bar J` and the limit :math:`d`, each batch does
+
+    .. math::
+        I &\leftarrow \mathrm{clip}(I + k_i (J - d),\ 0,\ \mathrm{max}) \\
+        \lambda &\leftarrow \mathrm{clip}(I + k_p (\bar J - d)
+            + k_d (\bar J - \bar J_\mathrm{previous})_+,\ 0,\ \mathrm{max})
+
+    The integral alone is :class:`~torchrl_safe.objectives.DualAscent` with ``lr = ki``. It lags
+    behind the policy, so that cost and multiplier circle round their optimum: the proportional
+    term damps that, and the derivative term answers a rising cost before the limit is passed (a
+    falling cost is never held up). The integral is kept within the bounds of the multiplier, so
+    that it comes back from either as soon as the violation changes its sign.
+
+    The multiplier moves with the noise of the batch costs times ``kp`` and ``kd``, and since noise
+    rises too, a steady batch cost of standard deviation s lifts it by about ``0.56 * kd * s``.
+    ``smoothing`` takes most of that away at the price of a delay of about
+    ``1 / (1 - smoothing)`` batches. The authors' code (rlpyt, ``projects/safe``) smooths with
+    0.95, over some 1900 large batches; its derivative over several batches is not in the paper's
+    algorithm and not here.
+
+    The division by :math:`1 + \sum_i \lambda_i` that the paper adds is in
+    :func:`~torchrl_safe.objectives.penalized_advantage` and so in the losses, not here.
+
+    Args:
+        loss_module (LossModule): see :class:`MultiplierUpdater`. Its multiplier is where the
+            integral starts.
+
+    Keyword Args:
+        cost_limit (float, Tensor or Mapping): see :class:`MultiplierUpdater`.
+        kp (float): proportional gain, in multiplier per unit of violated cost.
+        ki (float): integral gain, in multiplier per unit of violated cost and batch.
+        kd (float): derivative gain, in multiplier per unit of cost risen since the last batch.
+        smoothing (float, optional): weight of the past in the moving average of the cost, from 0
+            up to but without 1. It starts at the first batch (algorithm 2 starts at 0, so that
+            the first batch counts as a rise). Defaults to ``0.0``, the cost itself, as there.
+        max_multiplier (float, optional): see :class:`MultiplierUpdater`.
+        pessimism (float, optional): see :class:`MultiplierUpdater`.
+        normalize (bool, optional): see :class:`MultiplierUpdater`. The gains are then per unit of
+            normalized violation, whose rise it is that the derivative term answers.
+        cost_names (sequence of str, optional): see :class:`MultiplierUpdater`.
+
+    Raises:
+        ValueError: if a gain is negative or not finite, or ``smoothing`` is outside ``[0, 1)``.
+
+    A multiplier that is assigned or loaded between two steps moves the integral by as much.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.objectives import LossModule
+        >>> loss = LossModule()
+        >>> loss.register_buffer("lagrange_multiplier", torch.zeros(1))
+        >>> updater = PIDControl(loss, cost_limit=1.0, kp=2.0, ki=0.5, kd=1.0)
+        >>> updater.step(torch.tensor([[2.0]]))  # 0.5 * 1 + 2 * 1, and nothing to rise from
+        >>> loss.lagrange_multiplier
+        tensor([2.5000])
+        >>> updater.step(torch.tensor([[3.0]]))  # 0.5 * (1 + 2) + 2 * 2 + 1 * (3 - 2)
+        >>> loss.lagrange_multiplier
+        tensor([6.5000])
+    """
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        *,
+        cost_limit: float | Tensor | Mapping[str, float],
+        kp: float,
+        ki: float,
+        kd: float,
+        smoothing: float = 0.0,
+        max_multiplier: float | None = None,
+        pessimism: float = 0.0,
+        normalize: bool = False,
+        cost_names: Sequence[str] | None = None,
+    ) -> None:
+        super().__init__(
+            loss_module,
+            cost_limit=cost_limit,
+            max_multiplier=max_multiplier,
+            pessimism=pessimism,
+            normalize=normalize,
+            cost_names=cost_names,
+        )
+        self.kp, self.ki, self.kd = (
+            check_number(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd))
+        )
+        if not 0 <= as_number(smoothing) < 1:
+            raise ValueError(f"smoothing must be at least 0 and less than 1, got {smoothing!r}.")
+        self.smoothing = as_number(smoothing)
+        multiplier = loss_module.lagrange_multiplier
+        self.integral = multiplier.clone()
+        # NaN until there has been a batch.
+        self.smoothed_cost = torch.full_like(multiplier, float("nan"))
+        self.last_multiplier = multiplier.clone()
+
+    def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
+        # The cost, not the violation: a limit that somebody changes is no rise. (A normalized
+        # violation has no unit in which the limit could be added.)
+        limit = self.cost_limit.to(multiplier) * (not self.normalize)
+        cost = violation + limit
+        previous = self.smoothed_cost.to(multiplier)
+        previous = torch.where(previous.isnan(), cost, previous)
+        smoothed = cost.lerp(previous, self.smoothing)
+        # As in DualAscent, an assigned or loaded multiplier is never overwritten by a stale one.
+        assigned = multiplier - self.last_multiplier.to(multiplier)
+        integral = (self.integral.to(multiplier) + assigned).add(violation, alpha=self.ki)
+        integral = integral.clamp(0, self.max_multiplier)
+        rise = (smoothed - previous).clamp_min(0)
+        proposal = integral + self.kp * (smoothed - limit) + self.kd * rise
+        proposal = proposal.clamp(0, self.max_multiplier)
+        if proposal.isfinite().all():  # Else ``step`` refuses it, and nothing may have changed.
+            self.integral, self.smoothed_cost, self.last_multiplier = integral, smoothed, proposal
+        return proposal
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            **super().state_dict(),
+            "gains": torch.tensor([self.kp, self.ki, self.kd], dtype=torch.float64),
+            "smoothing": self.smoothing,
+            "integral": self.integral.clone(),
+            "smoothed_cost": self.smoothed_cost.clone(),
+            "last_multiplier": self.last_multiplier.clone(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self.kp, self.ki, self.kd = state_dict["gains"].tolist()
+        self.smoothing = state_dict["smoothing"]
+        self.integral = state_dict["integral"].clone()
+        self.smoothed_cost = state_dict["smoothed_cost"].clone()
+        self.last_multiplier = state_dict["last_multiplier"].clone()

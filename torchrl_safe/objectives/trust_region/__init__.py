@@ -1,0 +1,1 @@
+"""Trust-region methods: one step of the policy for each batch."""
