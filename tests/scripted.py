@@ -110,7 +110,7 @@ def pick(env, row):
 def push_around(env, row):
     """Pushes the object to the goal by way of the base, where no obstacle is."""
     here, goal = env.arm_state.object_position[row, 0], _away_from_obstacles(env, row)
-    near = min(here[0], goal[0]) - 0.15
+    near = min(here[0], goal[0]) - 0.17
     # The tool is behind what it pushes: off the straight way, farther from the obstacle.
     aside = np.array([0, 0.08 * np.sign(goal[1] - here[1]), 0])
     stops = [here + aside, goal - aside]
