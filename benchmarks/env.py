@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
 from itertools import product
@@ -12,13 +12,14 @@ import gymnasium
 import numpy as np
 import panda_gym  # noqa: F401  (registers its environments)
 import torch
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, GymEnv
 
+from benchmarks import engines
 from benchmarks.floor import Tape
 from benchmarks.original import OriginalEnv
 from benchmarks.report import Figure
+from benchmarks.rollouts import Canned, episode, play, play_gym, rollout
 from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.agent import make_agent
 from torchrl_safe.envs import (
@@ -40,49 +41,6 @@ _BARS = {("joint", 1): 0.5, ("joint", 12): 0.75, ("Cartesian", 1): 0.4, ("Cartes
 # An episode that no measurement reaches the end of: resets are timed apart.
 _ENDLESS = 10**9
 _PANDA_GYM_SUBSTEPS, _PANDA_GYM_EPISODE = 20, 50
-
-
-class Canned:
-    """A policy that plays the same random actions again and again.
-
-    Args:
-        env: where it plays.
-        steps: how many actions it has.
-    """
-
-    def __init__(self, env: EnvBase, steps: int) -> None:
-        generator = torch.Generator().manual_seed(0)
-        shape = (steps, *env.action_spec.shape)
-        self._actions = 2 * torch.rand(shape, generator=generator) - 1
-        self._step = 0
-
-    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict["action"] = self._actions[self._step % len(self._actions)]
-        self._step += 1
-        return tensordict
-
-
-def rollout(env: EnvBase, steps: int) -> Contender:
-    """Steps through ``rollout`` from a reset, which is not timed."""
-    policy = Canned(env, steps)
-
-    def contender() -> float:
-        env.set_seed(0)
-        start = env.reset()
-        return timed(lambda: play(env, policy, steps, start))()
-
-    return contender
-
-
-def play(env: EnvBase, policy: Canned, steps: int, start: TensorDictBase) -> None:
-    """Plays on from a state."""
-    env.rollout(steps, policy, auto_reset=False, tensordict=start, break_when_any_done=False)
-
-
-def episode(env: EnvBase, steps: int) -> Contender:
-    """Steps through ``rollout`` with the reset before them."""
-    policy = Canned(env, steps)
-    return timed(lambda: env.rollout(steps, policy, break_when_any_done=False))
 
 
 def floor(env: ArmEnv, steps: int) -> Contender:
@@ -224,15 +182,6 @@ def against_panda_gym(quick: bool) -> Iterator[Figure]:
         )
 
 
-def play_gym(
-    reset: Callable[[], Any], step: Callable[[np.ndarray], Any], actions: np.ndarray
-) -> None:
-    """Plays one episode."""
-    reset()
-    for action in actions:
-        step(action)
-
-
 def run(*, quick: bool) -> list[Figure]:
     """Measures all of it."""
     torch.set_num_threads(1)
@@ -241,4 +190,5 @@ def run(*, quick: bool) -> list[Figure]:
         *against_single_world(quick),
         *against_original(quick),
         *against_panda_gym(quick),
+        *engines.run(quick=quick),
     ]

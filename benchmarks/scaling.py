@@ -13,8 +13,8 @@ from torchrl import torchrl_logger
 from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 
-from benchmarks.env import rollout
 from benchmarks.report import Figure
+from benchmarks.rollouts import rollout
 from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.agent import make_agent
 from torchrl_safe.envs import ArmEnv, Collision, JointDelta, NoObstacles, Scattered

@@ -4,11 +4,9 @@ import multiprocessing
 
 import pytest
 import torch
-from worlds import turntable_settings
+from worlds import ENGINES, turntable_settings
 
-from torchrl_safe.envs import ArmEnv, Bullet, MuJoCo
-
-ENGINES = {"bullet": Bullet(), "mujoco": MuJoCo(threads=1)}
+from torchrl_safe.envs import ArmEnv
 
 
 @pytest.fixture

@@ -17,6 +17,10 @@ from torchrl_safe.envs import IIWA, PANDA, UR5, UR10, XARM6, XARM7
 # the forearm above.
 SAFE_HEIGHT, LOW = 0.33, 0.033
 
+# Share of the way, and of the speed, that a pilot asks for: at full speed it takes more than the
+# motors' efforts to stop within a control step.
+CALM = 0.65
+
 # Orientations of the tool that keep the arm off an obstacle beside the object. Turned by a
 # quarter, the hand shows it its narrow side; to which side, decides where the elbow of an arm
 # with seven joints goes. The wrist of a UR hangs too low for that: leaning, it stays back.
@@ -29,7 +33,7 @@ HOLD = {PANDA: RIGHT, IIWA: RIGHT, XARM6: RIGHT, XARM7: LEFT, UR5: LEANING, UR10
 
 
 def fly(env, pilot, steps=None):
-    """Plays one episode in each world, with an action of at most 1 in any component.
+    """Plays one episode in each world, with actions of at most ``CALM``.
 
     Args:
         env: an ArmEnv with Cartesian actions.
@@ -49,7 +53,7 @@ def fly(env, pilot, steps=None):
     while alive.any() and steps != 0:
         target = np.array([point for point, _ in orders])
         delta = (target - env.arm_state.ee_position) / env.action_mode.step
-        delta /= np.maximum(1, np.abs(delta).max(1, keepdims=True))
+        delta *= CALM / np.maximum(1, np.abs(delta).max(1, keepdims=True))
         action[:, :3] = torch.as_tensor(delta)
         if env.action_mode.moves_fingers:
             action[:, -1] = torch.tensor([opening for _, opening in orders])
@@ -106,7 +110,7 @@ def pick(env, row):
 def push_around(env, row):
     """Pushes the object to the goal by way of the base, where no obstacle is."""
     here, goal = env.arm_state.object_position[row, 0], _away_from_obstacles(env, row)
-    near = min(here[0], goal[0]) - 0.15
+    near = min(here[0], goal[0]) - 0.17
     # The tool is behind what it pushes: off the straight way, farther from the obstacle.
     aside = np.array([0, 0.08 * np.sign(goal[1] - here[1]), 0])
     stops = [here + aside, goal - aside]

@@ -33,6 +33,7 @@ from torchrl_safe.envs import (
     Region,
 )
 
+both_engines = pytest.mark.usefixtures("engine")
 ACTIONS = [CartesianDelta(), JointDelta()]
 HOME, TINY = [0.35, 0, 0.2], Region((0.5, -0.1, 0), (0.6, 0.1, 0))
 TWO = (Cylinder(), Cylinder())
@@ -129,6 +130,7 @@ def test_observation_of_motion(make_env):
         np.testing.assert_allclose(field, getattr(env.arm_state, name)[0], atol=1e-5)
 
 
+@both_engines
 @pytest.mark.parametrize("obstacles", [InFront(), ROLLING], ids=["fixed", "free"])
 @pytest.mark.parametrize("action", ACTIONS, **by_name)
 def test_same_seed_same_rollout_bit_for_bit(make_env, action, obstacles):
@@ -151,6 +153,7 @@ def test_same_seed_same_rollout_bit_for_bit(make_env, action, obstacles):
         assert torch.equal(one[key], two[key]), key
 
 
+@both_engines
 def test_reset_forgets_the_obstacle_it_is_pushing(make_env):
     """Bullet keeps contact points over a restored state, unless they are taken away first."""
 
@@ -168,6 +171,7 @@ def test_reset_forgets_the_obstacle_it_is_pushing(make_env):
         assert all(map(torch.equal, expected, got))
 
 
+@both_engines
 def test_other_seed_other_goals(make_env):
     env = make_env(ArmEnv, num_envs=2, seed=0)
     goals = []
@@ -180,6 +184,7 @@ def test_other_seed_other_goals(make_env):
     assert len(np.unique(goals, axis=0)) == len(goals) == 6
 
 
+@both_engines
 def test_rows_are_seeded_as_workers_are(make_env):
     """Two environments of one world, seeded in TorchRL's chain, are one environment of two."""
     both = make_env(ArmEnv, num_envs=2, seed=3)
@@ -207,6 +212,7 @@ def test_costs_keep_their_order(make_env):
     assert env.cost_names == ("two", "one")
 
 
+@both_engines
 def test_partial_reset_leaves_the_other_worlds_alone(make_env):
     """Row 1 must go on as if row 0 had never been reset: its simulator, not only its output."""
     settings = {"num_envs": 2, "obstacles": ROLLING, "seed": 5}
@@ -235,6 +241,7 @@ def test_partial_reset_leaves_the_other_worlds_alone(make_env):
     assert np.array_equal(alone.arm_state.goal[1], disturbed.arm_state.goal[1])
 
 
+@both_engines
 def test_the_state_tells_the_time(make_env):
     """Of each world's own episode, to tasks, costs and observations alike."""
     seen = {}
@@ -304,6 +311,7 @@ def test_success_terminates(make_env):
         pytest.fail("the tool never arrived")
 
 
+@both_engines
 def test_terminal_observation_is_true(make_env):
     """After an automatic reset, "next" still holds where the episode ended."""
     env = make_env(ArmEnv, max_episode_steps=4, obstacles=NoObstacles(), seed=0)
@@ -344,6 +352,7 @@ def test_touch_in_the_middle_of_a_control_step_counts(make_env):
     assert lost > 0
 
 
+@both_engines
 def test_states_and_resets_do_not_remember_touches(make_env):
     env = make_env(ArmEnv, seed=0)
     env.reset()
@@ -356,6 +365,7 @@ def test_states_and_resets_do_not_remember_touches(make_env):
     assert env.arm_state.contact_distance == np.inf
 
 
+@both_engines
 def test_the_obstacle_stands_in_the_way_and_can_be_passed(make_env):
     """Straight at the goal, every episode collides; over the obstacle, all succeed at no cost."""
     env = make_env(ArmEnv, num_envs=32, seed=0)
@@ -501,6 +511,7 @@ def test_closed_environment_says_so(make_env):
     assert worlds_of(other)[0].read() == before
 
 
+@both_engines
 @pytest.mark.parametrize("copier", [copy.deepcopy, pickle.dumps], ids=["deepcopy", "pickle"])
 def test_environments_are_not_copied(make_env, copier):
     env = make_env(ArmEnv, seed=0)
@@ -535,6 +546,7 @@ def test_device_is_that_of_the_tensors(make_env):
     assert rollout.device == torch.device("cpu")
 
 
+@both_engines
 @pytest.mark.parametrize("action", ACTIONS, **by_name)
 def test_velocities_are_derivatives(make_env, action):
     """At one substep a control step, velocity times 1/240 s is the change of position."""
@@ -593,6 +605,7 @@ def test_pixels_in_a_rollout(make_env):
     assert pixels.float().std() > 10
 
 
+@both_engines
 def test_pictures_show_the_arm_and_the_target(make_env):
     env = make_env(ArmEnv, num_envs=2, obstacles=NoObstacles(), seed=0)
 
@@ -607,7 +620,8 @@ def test_pictures_show_the_arm_and_the_target(make_env):
     one, two = targets(before)
     assert (one - two).abs().max() > 2, "each world has its own target"
     wide = env.render(width=192, height=96)
-    assert torch.equal(wide[:, :, 48:144], before), "more width shows more, at the same scale"
+    shown = wide[:, :, 48:144].int() - before.int()
+    assert shown.abs().max() < 10, "more width shows more, at the same scale"
     for _ in range(10):
         step(env, torch.tensor([[1.0, 1, 1], [0, 0, 0]]))
     changed = (env.render(width=96, height=96).int() - before.int()).abs().sum(-1) > 60

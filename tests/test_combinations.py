@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
-from worlds import ARMS, combinations
+from worlds import ARMS, ENGINES, combinations
 
 from torchrl_safe.envs import (
     ArmEnv,
@@ -75,9 +75,10 @@ def play(env, actions, disturb=()):
 
 
 @pytest.mark.parametrize(
-    ("arm", "action", "task", "obstacles"), combinations(ARMS, ACTIONS, TASKS, OBSTACLES)
+    ("arm", "action", "task", "obstacles", "physics"),
+    combinations(ARMS, ACTIONS, TASKS, OBSTACLES, ENGINES),
 )
-def test_combination(make_env, arm, action, task, obstacles):
+def test_combination(make_env, arm, action, task, obstacles, physics):
     """Specs; finite values; a seed is a rollout, bit for bit; resets are worlds' own affairs."""
     env = make_env(
         ArmEnv,
@@ -87,6 +88,7 @@ def test_combination(make_env, arm, action, task, obstacles):
         task=TASKS[task],
         obstacles=OBSTACLES[obstacles],
         costs=COSTS[obstacles],
+        physics=ENGINES[physics],
         frame_skip=2,
         max_episode_steps=70,
         seed=0,

@@ -18,7 +18,15 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 from worlds import combinations
 
-from torchrl_safe.envs import PAPER_JOINT, ArmEnv, Collision, JointDelta, NoObstacles
+from torchrl_safe.envs import (
+    PAPER_JOINT,
+    ArmEnv,
+    Bullet,
+    Collision,
+    JointDelta,
+    MuJoCo,
+    NoObstacles,
+)
 from torchrl_safe.envs.gym import (
     ACTIONS,
     ARMS,
@@ -111,6 +119,19 @@ def test_arguments_of_make_override():
     *_, info = env.step(np.zeros(7, np.float32))
     assert info == {"cost": 1.0, "costs": {"collision": 0.0, "one": 1.0}, "is_success": False}
     env.close()
+
+
+def test_physics_is_an_argument():
+    """Of every name; the same goals and obstacles, in another engine."""
+    seen = []
+    for settings in ({}, {"physics": MuJoCo(threads=1)}):
+        env = gymnasium.make(NAME, **settings)
+        seen.append(env.reset(seed=0)[0])
+        fields = env.unwrapped.arm_env.observation_fields
+        assert type(env.unwrapped.arm_env.physics) is type(settings.get("physics", Bullet()))
+        env.close()
+    for name in ("to_goal", "to_obstacle"):
+        np.testing.assert_allclose(*(one[fields[name]] for one in seen), atol=1e-6)
 
 
 def test_same_numbers_as_the_arm(make_env):

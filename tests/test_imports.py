@@ -168,4 +168,6 @@ def test_an_engine_is_known_in_its_folder_only(engine, folder):
     assert not users
     if engine == "pybullet":  # The other one's name is that of our own class too.
         word = re.compile(r"\bpybullet\b", re.IGNORECASE)
-        assert not {str(path) for path in sources if word.search(path.read_text("utf-8"))}
+        # Nor is it named elsewhere, but by its rival, in comparison.
+        others = [path for path in sources if "mujoco" not in path.parts]
+        assert not {str(path) for path in others if word.search(path.read_text("utf-8"))}

@@ -234,7 +234,7 @@ def test_kinematics_are_those_of_mujoco(arm):
 
 @each_arm
 @pytest.mark.parametrize(
-    ("step_size", "quantiles"), [(0.03, (0.05, 0.95)), (0.1, (0.3, 0.7))], ids=["small", "large"]
+    ("step_size", "quantiles"), [(0.02, (0.05, 0.95)), (0.1, (0.4, 0.6))], ids=["small", "large"]
 )
 def test_an_action_does_what_it_asks_for(make_env, arm, step_size, quantiles):
     """To within 5 %; efforts do not allow every change of 0.1 rad in 0.05 s."""
@@ -305,8 +305,8 @@ def test_pictures_show_what_there_is(make_env, arm):
     for picture in first.int():
         red, green, blue = picture.unbind(-1)
         assert ((red > 2 * green) & (red > 2 * blue)).sum() > 100
-        assert ((blue > 2 * red) & (blue > 1.3 * green)).sum() > 5
-        assert ((red > 2 * blue) & (green > 2 * blue)).sum() > 5
+        assert ((blue > 2 * red) & (blue > 1.3 * green)).sum() > 2
+        assert ((red > 2 * blue) & (green > 2 * blue)).sum() > 2
     assert not torch.equal(first[0], first[1])
     assert env.render(80, 60).shape == (2, 60, 80, 3)
     np.testing.assert_array_equal(env._simulator._batch.state, state)

@@ -118,7 +118,9 @@ def test_advantages_are_those_of_each_agent_alone():
     peer = MultiAgentGAE(gamma=0.99, lmbda=0.95, value_network=make_mappo().critic_network)
     peer.set_keys(value=KEYS["value"])
     expected = peer(reward)["advantage"]
-    expected = (expected - expected.mean()) / expected.std()
+    # MAPPO's normalize_advantage_exclude_dims leaves each agent its own scale.
+    expected = expected - expected.mean((0, 1), keepdim=True)
+    expected = expected / expected.std((0, 1), keepdim=True)
     torch.testing.assert_close(batch["advantage"], expected)
 
 

@@ -102,7 +102,7 @@ def test_folding_into_itself_is_a_touch(make_env, name):
     costs = np.array([step(env, FOLD[name])["cost"].item() for _ in range(40)])
     assert not costs[0]
     # Links slide over each other, and off each other for some steps.
-    assert costs[10:].mean() > 0.5
+    assert costs[10:].mean() > 0.25
     env.reset()
     assert np.isinf(env.arm_state.trace["self_distance"]).all()
     assert not rest(env)["cost"].any()

@@ -13,7 +13,9 @@ from tensordict import TensorDict
 
 from torchrl_safe.envs import (
     ArmModel,
+    Bullet,
     JointDelta,
+    MuJoCo,
     NoObstacles,
     Placement,
     Reach,
@@ -21,6 +23,7 @@ from torchrl_safe.envs import (
     gym,
 )
 
+ENGINES = {"bullet": Bullet(), "mujoco": MuJoCo(threads=1)}
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial, reduce
 from numbers import Integral
 from operator import or_
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -376,6 +376,12 @@ class ArmEnv(EnvBase):
     def close(self, *, raise_if_closed: bool = True) -> None:
         super().close(raise_if_closed=raise_if_closed)
         self._simulator.close()
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "A simulated world cannot be copied or pickled; pass a factory, such as "
+            "functools.partial(ArmEnv, num_envs=8)."
+        )
 
     def _check_open(self) -> None:
         if self.is_closed:

@@ -124,7 +124,7 @@ def _nearest(simulator: Simulator, home: Sequence[float], point: Array) -> float
         if nearest < _ARRIVED:
             break
         start = generator.uniform(lower, upper)
-        again = approach(simulator, start, point, respect_limits=False)
+        again = approach(simulator, start.tolist(), point, respect_limits=False)
         nearest = min(nearest, again.distance)
     return nearest
 

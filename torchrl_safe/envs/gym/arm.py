@@ -25,8 +25,8 @@ class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ``max_episode_steps`` for a wrapper of its own, which can shorten the limit, not lengthen it.
 
     Args:
-        render_mode (str, optional): ``"human"`` shows a window, with ``"rgb_array"``
-            ``render`` returns a picture. Defaults to ``None``: nothing is drawn.
+        render_mode (str, optional): ``"human"`` shows a window (with ``physics=Bullet()``); with
+            ``"rgb_array"`` ``render`` returns a picture. Defaults to ``None``: nothing is drawn.
         **kwargs: arguments of :class:`~torchrl_safe.envs.ArmEnv` except ``num_envs``, which is
             1, and ``gui``, on which ``render_mode`` decides.
 

@@ -22,6 +22,7 @@ class Scene:
         motor_limits: keep the motors within the efforts and speeds of the URDF.
 
     Raises:
+        TypeError: if a flag is not True or False.
         ValueError: if ``gravity`` is not finite.
 
     Examples:

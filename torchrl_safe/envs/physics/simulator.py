@@ -32,23 +32,34 @@ class Simulator(Protocol):
 
     Worlds do not depend on each other: what happens in a row is the same, bit for bit, whatever
     the other rows do, and whatever has happened in this row before its last :meth:`reset`.
-
-    Attributes:
-        joint_lower: lower limits of the arm's joints, rad, ``(n,)``, -inf without limit.
-        joint_upper: upper limits of the arm's joints, rad, ``(n,)``.
-        joint_speed: largest speeds of the arm's joints, rad/s, ``(n,)``, inf where the URDF has
-            none. ArmEnv clips targets to them, if the scene has motor limits; a simulator need not.
-        finger_speed: largest speeds of the free finger joints, m/s, ``(f,)``.
-        home_position: tool point at the arm's ``home``, m, ``(3,)``.
-        home_orientation: tool orientation there, ``(4,)``.
     """
 
-    joint_lower: Array
-    joint_upper: Array
-    joint_speed: Array
-    finger_speed: Array
-    home_position: Array
-    home_orientation: Array
+    @property
+    def joint_lower(self) -> Array:
+        """Lower limits of the arm's joints, rad, ``(n,)``; -inf without limit."""
+
+    @property
+    def joint_upper(self) -> Array:
+        """Upper limits of the arm's joints, rad, ``(n,)``; inf without limit."""
+
+    @property
+    def joint_speed(self) -> Array:
+        """Largest speeds of the arm's joints, rad/s, ``(n,)``; inf where the URDF has none.
+
+        ArmEnv clips targets to them, if the scene has motor limits; a simulator need not.
+        """
+
+    @property
+    def finger_speed(self) -> Array:
+        """Largest speeds of the free finger joints, m/s, ``(f,)``."""
+
+    @property
+    def home_position(self) -> Array:
+        """Tool point at the arm's ``home``, m, ``(3,)``."""
+
+    @property
+    def home_orientation(self) -> Array:
+        """Tool orientation at the arm's ``home``, ``(4,)``."""
 
     def reset(self, row: int, placement: Placement, goal: Array, objects: Array) -> None:
         """Begins an episode in one world; the other worlds stay as they are.

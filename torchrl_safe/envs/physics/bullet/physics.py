@@ -37,7 +37,7 @@ class Bullet:
             physics substep late, as PyBullet does unless told otherwise.
 
     Raises:
-        TypeError: if a flag is neither True nor False.
+        TypeError: if a flag is not True or False.
         ValueError: if ``motor_gain`` is not positive.
 
     Examples:

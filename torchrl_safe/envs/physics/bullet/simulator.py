@@ -9,6 +9,7 @@ from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Placement
@@ -72,10 +73,12 @@ class BulletSimulator:
             self.close()
             raise
         first = self.worlds[0]
-        self.joint_lower, self.joint_upper = first.joint_lower, first.joint_upper
-        self.joint_speed, self.finger_speed = first.joint_speed, first.finger_speed
-        self.home_position = np.array(first.home_position)
-        self.home_orientation = np.array(first.home_orientation)
+        self.joint_lower: Array = first.joint_lower
+        self.joint_upper: Array = first.joint_upper
+        self.joint_speed: Array = first.joint_speed
+        self.finger_speed: Array = first.finger_speed
+        self.home_position: Array = np.array(first.home_position)
+        self.home_orientation: Array = np.array(first.home_orientation)
         self._sizes = np.array([shape.half_extents for shape in shapes]).reshape(-1, 3)
         self._parts = parts(first.read_shapes())
         self._trace_parts = parts(first.trace_shapes())
@@ -176,7 +179,7 @@ class BulletSimulator:
                 stacklevel=2,
             )
 
-    def pictures(self, camera: Camera, width: int, height: int) -> Array:
+    def pictures(self, camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
         """Returns an RGB picture of every world, uint8, ``(N, height, width, 3)``."""
         if self._picture_world is None:
             self._picture_world = World(*self._build, visuals=True)

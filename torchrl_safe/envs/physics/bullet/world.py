@@ -7,7 +7,7 @@ import os
 import sys
 import weakref
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,13 +88,6 @@ class World:
         """Shuts the server down; afterwards every other method raises ``pybullet.error``."""
         self._disconnect()
         self._client = -1
-
-    def __reduce__(self) -> NoReturn:
-        # A copy would drive, and in the end disconnect, the server of this one.
-        raise TypeError(
-            "A simulated world cannot be copied or pickled; pass a factory, such as "
-            "functools.partial(ArmEnv, num_envs=8)."
-        )
 
     def _build(
         self,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.arms.urdf import prepare_urdf
 from torchrl_safe.envs.physics.mujoco.contacts import set_arm_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.mujoco.meshes import read_meshes
 from torchrl_safe.envs.state import Array
 
 # What MuJoCo's reader of URDF files is told: keep every link, and paths as they are.
@@ -70,12 +70,12 @@ def read_arm(
     text, chain, tool = prepare_urdf(arm, visuals=visuals, fix_fingers=fix_fingers, merge=merge)
     root = ElementTree.fromstring(text)
     _rename_world(root)
-    skins = _read_skins(root) if visuals else {}
+    meshes = read_meshes(root)
     extension = ElementTree.SubElement(root, "mujoco")
     ElementTree.SubElement(extension, "compiler", _COMPILER, discardvisual=str(not visuals).lower())
     try:
         text = ElementTree.tostring(root, encoding="unicode")
-        spec = mujoco.MjSpec.from_string(text, assets=skins)
+        spec = mujoco.MjSpec.from_string(text, assets=meshes)
     except ValueError as error:
         raise ValueError(f"urdf {arm.urdf!r} does not load in MuJoCo: {error}") from error
     parts = _find_parts(spec, root, chain, tool)
@@ -96,41 +96,6 @@ def _rename_world(root: ElementTree.Element) -> None:
         for key in ("name", "link"):
             if element.tag in ("link", "parent") and element.get(key) == "world":
                 element.set(key, _ROOT)
-
-
-def _read_skins(root: ElementTree.Element) -> dict[str, bytes]:
-    """Returns the files of what is only drawn, in words that MuJoCo understands, by their names.
-
-    Of a Wavefront file MuJoCo reads the first of several objects, and COLLADA not at all: of links
-    that have nothing else to show, the shapes that collide are drawn.
-    """
-    skins = {}
-    for link in root.iter("link"):
-        for visual in link.findall("visual"):
-            mesh = visual.find("geometry/mesh")
-            if mesh is None:
-                continue
-            file = Path(mesh.get("filename", ""))
-            if file.suffix.lower() == ".dae":
-                link.remove(visual)
-            elif file.suffix.lower() == ".obj":
-                name = f"skin-{len(skins)}.obj"
-                skins[name] = _plain(file.read_text())
-                mesh.set("filename", name)
-    return skins
-
-
-def _plain(text: str) -> bytes:
-    """A Wavefront file with corners and faces only: a single object."""
-    lines = []
-    for line in text.splitlines():
-        kind, _, rest = line.partition(" ")
-        if kind == "v":
-            lines.append(line)
-        elif kind == "f":
-            # A corner can be corner/texture/normal.
-            lines.append("f " + " ".join(corner.partition("/")[0] for corner in rest.split()))
-    return "\n".join(lines).encode()
 
 
 def _find_parts(spec: Any, root: ElementTree.Element, chain: set[str], tool: str) -> ArmParts:

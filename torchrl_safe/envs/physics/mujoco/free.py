@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_safe.envs.physics.mujoco.vectors import turn
 from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.state import Array
+
+Indices = NDArray[np.int_]
 
 #: MuJoCo's quaternions are w, x, y, z, ours x, y, z, w.
 TO_MUJOCO, _TO_OURS = [3, 0, 1, 2], [1, 2, 3, 0]
@@ -33,7 +36,7 @@ class FreeBodies:
         qpos[self._position[:, :3]] = position
         qpos[self._position[:, 3:]] = orientation[..., TO_MUJOCO]
 
-    def hold(self, qpos: Array, qvel: Array, row: Array, index: Array, position: Array) -> None:
+    def hold(self, qpos: Array, qvel: Array, row: Indices, index: Indices, position: Array) -> None:
         """Puts some of them in places, upright and at rest."""
         qpos[row[:, None], self._position[index]] = np.hstack(
             [position, np.tile((1.0, 0.0, 0.0, 0.0), (len(row), 1))]

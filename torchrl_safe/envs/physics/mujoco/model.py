@@ -7,12 +7,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.arm import ArmParts, read_arm
-from torchrl_safe.envs.physics.mujoco.bodies import add_object, add_obstacle, add_table
-from torchrl_safe.envs.physics.mujoco.contacts import exclude_overlaps, set_options
+from torchrl_safe.envs.physics.mujoco.bodies import (
+    add_object,
+    add_obstacle,
+    add_table,
+    obstacle,
+)
+from torchrl_safe.envs.physics.mujoco.contacts import (
+    exclude_overlaps,
+    measure_base,
+    set_options,
+)
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.mujoco.inertia import set_box_inertias
 from torchrl_safe.envs.physics.mujoco.motors import add_motors, add_rotors, set_gains
@@ -38,8 +48,8 @@ class World:
     model: Any
     parts: ArmParts
     places: dict[str, Place]
-    position: Array
-    velocity: Array
+    position: NDArray[np.int_]
+    velocity: NDArray[np.int_]
     home: Array
 
 
@@ -63,6 +73,9 @@ def build_world(
         raise ValueError(f"urdf {arm.urdf!r} does not load in MuJoCo: {error}") from error
     set_options(spec, scene.gravity)
     _add_bodies(spec, shapes, objects, reach=max(CONTACT_RANGE, sensing.clearance))
+    if sensing.clearance:
+        fixed = [obstacle(index) for index, shape in enumerate(shapes) if not shape.mass]
+        measure_base(spec, parts.moving, fixed, reach=sensing.clearance)
     add_motors(spec, parts, limited=scene.motor_limits)
     sensors = Sensors(spec, parts, shapes, sensing)
     model, data = _at_home(spec, arm, parts)

@@ -85,7 +85,9 @@ class MuJoCoSimulator:
         self._is_free = np.array([shape.mass > 0 for shape in shapes], dtype=bool)
         self._tracks = Tracks(num_envs, len(shapes), frame_skip)
         self._objects = FreeBodies(model, [thing(index) for index in range(len(objects))])
-        self._free = FreeBodies(model, [obstacle(i) for i in np.flatnonzero(self._is_free)])
+        self._free = FreeBodies(
+            model, [obstacle(i) for i in np.flatnonzero(self._is_free).tolist()]
+        )
         self._goal = np.zeros((num_envs, 3))
         self._steps = np.zeros(num_envs, dtype=int)
         self._contact_distance = np.full((num_envs, len(shapes)), np.inf)

@@ -68,8 +68,8 @@ class Tracks:
         assert placement is not None
         ways = look_ahead(placement, int(self._begin[row]), substeps)
         absent = ~placement.present
-        for part, nothing in zip(ways, (self._limbo[absent], UPRIGHT, 0.0, 0.0), strict=True):
-            part[:, absent] = nothing
+        ways.position[:, absent], ways.orientation[:, absent] = self._limbo[absent], UPRIGHT
+        ways.velocity[:, absent] = ways.angular_velocity[:, absent] = 0
         if self._ways is not None:
             for all_ways, part in zip(self._ways, ways, strict=True):
                 all_ways[row] = part

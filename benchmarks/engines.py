@@ -1,0 +1,179 @@
+"""MuJoCo against PyBullet, against a bare batch of itself, and against panda-gym."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from functools import partial
+from itertools import product
+from time import perf_counter, process_time
+from typing import Any
+from unittest import mock
+
+import gymnasium
+import numpy as np
+import panda_gym  # noqa: F401  (registers its environments)
+
+from benchmarks.report import Figure
+from benchmarks.rollouts import Canned, episode, play, play_gym, rollout
+from benchmarks.timing import Contender, quartiles, race, ratio, timed
+from torchrl_safe.envs import (
+    ActionMode,
+    ArmEnv,
+    Bullet,
+    CartesianDelta,
+    Human,
+    JointDelta,
+    MuJoCo,
+    NoObstacles,
+    SpeedAndSeparation,
+)
+
+_ACTIONS: dict[str, ActionMode] = {"joint": JointDelta(), "Cartesian": CartesianDelta()}
+_AT_LEAST = {1: 4.0, 12: 3.0}
+_ENDLESS = 10**9
+_PANDA_GYM_SUBSTEPS, _PANDA_GYM_EPISODE = 20, 50
+
+
+def bare_batch(env: ArmEnv, steps: int) -> Contender:
+    """The same model, controls and sensors as in :func:`rollout`, in MuJoCo's own batch."""
+    batch, policy = env._simulator._batch, Canned(env, steps)  # type: ignore[attr-defined]
+    advance, calls = batch.rollout, []
+
+    def record(nstep: int, control: np.ndarray, **options: Any) -> Any:
+        calls.append((nstep, control.copy(), {**options, "out": None}))
+        return advance(nstep, control, **options)
+
+    env.set_seed(0)
+    start = env.reset()
+    state = batch.state.copy()
+    with mock.patch.object(batch, "rollout", record):
+        play(env, policy, steps, start)
+
+    def contender() -> float:
+        batch.state[:] = state
+        out = None
+        begin = process_time()
+        for nstep, control, options in calls:
+            out = advance(nstep, control, **{**options, "out": out})
+        return process_time() - begin
+
+    return contender
+
+
+def against_bullet(quick: bool) -> Iterator[Figure]:
+    """Rollouts of both, and what MuJoCo's costs beside physics; processor time of one thread."""
+    worlds, rounds = (2, 2) if quick else (128, 5)
+    for (name, action), substeps in product(_ACTIONS.items(), (1, 12)):
+        steps = 4 if quick else (32 if substeps == 1 else 16)
+        make = partial(
+            ArmEnv,
+            num_envs=worlds,
+            action=action,
+            frame_skip=substeps,
+            max_episode_steps=_ENDLESS,
+        )
+        with closing(make(physics=Bullet())) as theirs, closing(make(physics=MuJoCo(1))) as ours:
+            times = race(
+                {
+                    "Bullet": rollout(theirs, steps),
+                    "MuJoCo": rollout(ours, steps),
+                    "bare batch": bare_batch(ours, steps),
+                },
+                rounds=rounds,
+            )
+        case = f"{name}, substeps {substeps}, {worlds} worlds"
+        yield ratio(
+            f"{case}: MuJoCo / Bullet",
+            times["Bullet"],
+            times["MuJoCo"],
+            at_least=_AT_LEAST[substeps],
+        )
+        yield ratio(
+            f"{case}: MuJoCo / its bare batch",
+            times["bare batch"],
+            times["MuJoCo"],
+            at_least=0.6 if substeps == 12 else None,
+        )
+        yield quartiles(
+            f"{case}: a step of MuJoCo beside physics",
+            1e3 * (times["MuJoCo"] - times["bare batch"]) / steps,
+            "ms",
+            at_most=1.0,
+        )
+        yield quartiles(f"{case}: MuJoCo", steps * worlds / times["MuJoCo"], "steps/s")
+
+
+def on_two_threads(quick: bool) -> Iterator[Figure]:
+    """By the clock on the wall: needs two cores that are free."""
+    worlds, steps, rounds = (2, 4, 2) if quick else (128, 16, 5)
+    for name, action in _ACTIONS.items():
+        make = partial(ArmEnv, num_envs=worlds, action=action, max_episode_steps=_ENDLESS)
+        with closing(make(physics=Bullet())) as theirs, closing(make(physics=MuJoCo(2))) as ours:
+            times = race(
+                {
+                    "Bullet": rollout(theirs, steps, clock=perf_counter),
+                    "MuJoCo": rollout(ours, steps, clock=perf_counter),
+                },
+                rounds=rounds,
+            )
+        yield ratio(
+            f"{name}, substeps 12, {worlds} worlds, wall: MuJoCo on two threads / Bullet",
+            times["Bullet"],
+            times["MuJoCo"],
+            at_least=5,
+        )
+
+
+def what_costs_cost(quick: bool) -> Iterator[Figure]:
+    """A person with speed and separation monitoring, and a cylinder that is not to be touched."""
+    worlds, steps, rounds = (2, 4, 2) if quick else (128, 16, 5)
+    make = partial(ArmEnv, num_envs=worlds, physics=MuJoCo(1), max_episode_steps=_ENDLESS)
+    costs = {"separation": SpeedAndSeparation()}
+    with closing(make()) as plain, closing(make(obstacles=Human(), costs=costs)) as human:
+        times = race(
+            {"plain": rollout(plain, steps), "human": rollout(human, steps)}, rounds=rounds
+        )
+    yield ratio(
+        f"substeps 12, {worlds} worlds: Human, SpeedAndSeparation / InFront, Collision (time)",
+        times["human"],
+        times["plain"],
+        at_most=2,
+    )
+
+
+def against_panda_gym(quick: bool) -> Iterator[Figure]:
+    """Episodes of 50 steps of 20 substeps, resets included, against PandaReach-v3."""
+    worlds, rounds = (2, 2) if quick else (128, 5)
+    steps = 4 if quick else _PANDA_GYM_EPISODE
+    theirs = gymnasium.make("PandaReach-v3")
+    ours = ArmEnv(
+        num_envs=worlds,
+        physics=MuJoCo(1),
+        obstacles=NoObstacles(),
+        frame_skip=_PANDA_GYM_SUBSTEPS,
+        max_episode_steps=_PANDA_GYM_EPISODE,
+    )
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, 3)).astype(np.float32)
+    with closing(theirs), closing(ours):
+        times = race(
+            {
+                "panda-gym": timed(partial(play_gym, theirs.reset, theirs.step, actions)),
+                "MuJoCo": episode(ours, steps),
+            },
+            rounds=rounds,
+        )
+    yield ratio(
+        f"Cartesian, substeps {_PANDA_GYM_SUBSTEPS}, {worlds} worlds: MuJoCo / panda-gym, raw",
+        times["panda-gym"] * worlds,
+        times["MuJoCo"],
+        at_least=5,
+    )
+
+
+def run(*, quick: bool) -> Iterator[Figure]:
+    """Measures all of it."""
+    yield from against_bullet(quick)
+    yield from on_two_threads(quick)
+    yield from what_costs_cost(quick)
+    yield from against_panda_gym(quick)
