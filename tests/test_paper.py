@@ -168,7 +168,7 @@ def test_going_around_costs_nothing(make_env):
         yield from go(env, row, side)
         yield from straight(env, row)
 
-    success, _, cost = fly(env, around)
+    success, _, cost = fly(env, around, share=1)
     assert success.all()
     assert not cost.any()
 
