@@ -32,13 +32,14 @@ LEANING = (0.0, math.cos(0.3), 0.0, math.sin(0.3))
 HOLD = {PANDA: RIGHT, IIWA: RIGHT, XARM6: RIGHT, XARM7: LEFT, UR5: LEANING, UR10: LEANING}
 
 
-def fly(env, pilot, steps=None):
-    """Plays one episode in each world, with actions of at most ``CALM``.
+def fly(env, pilot, steps=None, share=CALM):
+    """Plays one episode in each world, with actions of at most ``share``.
 
     Args:
         env: an ArmEnv with Cartesian actions.
         pilot: maps environment and row to a generator.
         steps: stop after so many steps. ``None`` goes on until all episodes have ended.
+        share: of the way, and of the speed, that an action asks for.
 
     Returns:
         Success, return and cost of each world.
@@ -53,7 +54,7 @@ def fly(env, pilot, steps=None):
     while alive.any() and steps != 0:
         target = np.array([point for point, _ in orders])
         delta = (target - env.arm_state.ee_position) / env.action_mode.step
-        delta *= CALM / np.maximum(1, np.abs(delta).max(1, keepdims=True))
+        delta *= share / np.maximum(1, np.abs(delta).max(1, keepdims=True))
         action[:, :3] = torch.as_tensor(delta)
         if env.action_mode.moves_fingers:
             action[:, -1] = torch.tensor([opening for _, opening in orders])

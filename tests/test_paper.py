@@ -150,7 +150,7 @@ def test_reward_is_the_l1_distance(make_env):
 def test_straight_policy_scores_as_in_the_original(make_env):
     """Measured there, 50 episodes: success 1.00, return -21.6 +- 6.6, cost 28.6 +- 15.1."""
     env = make_env(paper_env, num_envs=50, seed=1)
-    success, total, cost = fly(env, straight)
+    success, total, cost = fly(env, straight, share=1)
     assert success.all()
     standard_error = math.sqrt(1 / 50 + 1 / 50)
     assert total.mean() == pytest.approx(-21.6, abs=3 * 6.6 * standard_error)
@@ -168,7 +168,7 @@ def test_going_around_costs_nothing(make_env):
         yield from go(env, row, side)
         yield from straight(env, row)
 
-    success, _, cost = fly(env, around)
+    success, _, cost = fly(env, around, share=1)
     assert success.all()
     assert not cost.any()
 
