@@ -403,7 +403,8 @@ def test_every_algorithm_goes_on(algorithm, settings, tmp_path):
         (envs.Reach, "sparse"),
         (envs.Push, "sparse"),
         (envs.PickAndPlace, "sparse"),
-        (envs.Scene, "merged_links"),
+        (envs.Scene, "motor_limits"),
+        (envs.Bullet, "merged_links"),
         (envs.Sensing, "tool"),
     ],
 )

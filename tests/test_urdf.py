@@ -141,7 +141,7 @@ def test_urdf_is_found_by_its_path_or_in_the_packages(tmp_path):
     assert find_urdf(path) == tmp_path / "arm.urdf"
     data = Path(pybullet_data.getDataPath())
     assert find_urdf(PANDA.urdf) == data / "franka_panda" / "panda.urdf"
-    assert find_urdf("gripper.urdf").parent.name == "envs"
+    assert find_urdf("gripper.urdf").parent.name == "arms"
     assert find_urdf("ur_description/urdf/ur5_robot.urdf").is_file()
 
 

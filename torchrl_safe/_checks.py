@@ -46,13 +46,6 @@ def check_count(*, least: int = 1, **values: Any) -> None:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
 
 
-def check_flag(**values: bool) -> None:
-    """Raises TypeError unless each value is True or False."""
-    for name, value in values.items():
-        if not isinstance(value, bool | np.bool_):
-            raise TypeError(f"{name} must be True or False, got {value!r}.")
-
-
 def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
     """Raises TypeError unless the value is an object of a class or protocol, not a class."""
     if isinstance(value, type) or not isinstance(value, kind):

@@ -66,6 +66,7 @@ class ArmEnvConfig(EnvLibsConfig):
     frame_skip: int = 12
     max_episode_steps: int = 40
     scene: Any = field(default_factory=partial(_of, "torchrl_safe.envs.Scene"))
+    physics: Any = field(default_factory=partial(_of, "torchrl_safe.envs.Bullet"))
     seed: int | None = None
     device: Any = None
     gui: bool = False
