@@ -16,8 +16,8 @@ from torchrl_safe.envs.state import Array
 # would chatter.
 _RATE = 0.5 / SUBSTEP
 # What the rotors of geared motors add to what a joint turns at home. Without it, joints with nearly
-# the same axis, such as the first and third of a stretched arm, throw each other to and fro as soon
-# as both are at the end of their efforts: against each other they have next to no inertia.
+# the same axis, such as the first and third of a stretched arm, make each other swing as soon as
+# both are at the end of their efforts: against each other they have next to no inertia.
 _ROTORS = 0.5
 # Fingers press with all their effort what keeps them this far from where they are to be, m.
 _SQUEEZE = 0.005
