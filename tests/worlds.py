@@ -27,14 +27,14 @@ ENGINES = {"bullet": Bullet(), "mujoco": MuJoCo(threads=1)}
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 
 
-def combinations(*choices):
-    """All combinations as parameters; a third, with every pair of choices in it, is not slow."""
+def combinations(*choices, every=3):
+    """All combinations as parameters; one in `every`, with every pair in it, is not slow."""
     names = [list(choice) for choice in choices]
     return [
         pytest.param(
             *(choice[index] for choice, index in zip(names, indices, strict=True)),
             id="-".join(choice[index] for choice, index in zip(names, indices, strict=True)),
-            marks=[pytest.mark.slow] if sum(indices) % 3 else [],
+            marks=[pytest.mark.slow] if sum(indices) % every else [],
         )
         for indices in itertools.product(*(range(len(choice)) for choice in names))
     ]
