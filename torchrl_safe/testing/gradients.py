@@ -73,7 +73,7 @@ def check_gradients(
         loss.zero_grad()
         losses[key].sum().backward(retain_graph=True)
         reached = {
-            name.split("_network")[0].split(".")[-1]
+            _network_of(name)
             for name, parameter in loss.named_parameters()
             if parameter.grad is not None and parameter.grad.any()
         }
@@ -88,11 +88,16 @@ def check_gradients(
         )
         every |= reached
     loss.zero_grad()
-    networks = {name.split("_network")[0].split(".")[-1] for name, _ in loss.named_parameters()}
+    networks = {_network_of(name) for name, _ in loss.named_parameters()}
     require(
         every == networks,
         f"{named(loss)}: no output trains {sorted(networks - every)}, only {sorted(every)}",
     )
+
+
+def _network_of(parameter: str) -> str:
+    """The network of a parameter: ``actor`` for ``loss_module.actor_network_params.weight``."""
+    return parameter.split("_network")[0].split(".")[-1]
 
 
 def check_masked_steps(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -90,16 +89,6 @@ def in_precision(
     data = tensordict.clone(False)
     data.update(data.select(*keys, strict=False).apply(lambda entry: _in_precision(entry, dtype)))
     return data
-
-
-def actor_distribution(loss: PPOLoss, tensordict: TensorDictBase) -> Distribution:
-    """The present policy in the states of a batch."""
-    with (
-        loss.actor_network_params.to_module(loss.actor_network, preserve_module_state=False)
-        if loss.functional
-        else contextlib.nullcontext()
-    ):
-        return loss.actor_network.get_dist(tensordict.clone(False))
 
 
 def importance_weight(
