@@ -81,10 +81,11 @@ def figures(
     if not len(episodes):
         return multipliers
     costs = episodes["episode_cost"].mean(0).tolist()
+    success = episodes.get("success", None)
     return {
         "return": episodes["episode_reward"].mean().item(),
         **{f"cost/{name}": cost for name, cost in zip(cost_names, costs, strict=True)},
-        "success": episodes["success"].float().mean().item(),
+        **({"success": success.float().mean().item()} if success is not None else {}),
         **multipliers,
     }
 
@@ -101,7 +102,7 @@ def score(rows: Sequence[dict[str, float]], limit: float) -> float | None:
 def versions() -> dict[str, str]:
     """What the figures of a run depend on beside its settings."""
     found = {}
-    for name in ("torch", "torchrl", "pybullet", "mujoco"):
+    for name in ("torch", "torchrl", "pybullet", "mujoco", "gymnasium", "safety-gymnasium"):
         with suppress(PackageNotFoundError):
             found[name] = version(name)
     return found

@@ -12,7 +12,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 from packaging.version import Version
@@ -28,12 +28,15 @@ def resets_itself(env: Any) -> bool:
     return not _HAS_MODES or env.autoreset_mode == gymnasium.vector.AutoresetMode.SAME_STEP
 
 
-def async_vector_env(factories: Sequence[Callable[[], gymnasium.Env]]) -> AsyncVectorEnv:
-    """A process for each environment, in a mode in which last observations are not lost."""
+def vector_env(
+    factories: Sequence[Callable[[], gymnasium.Env]], *, asynchronous: bool
+) -> VectorEnv:
+    """Several environments, in a mode in which last observations are not lost."""
+    kind = AsyncVectorEnv if asynchronous else SyncVectorEnv
     if not _HAS_MODES:
-        return AsyncVectorEnv(factories)
+        return kind(factories)
     # In Gymnasium's default mode TorchRL 0.14.1 overwrites the last observations with zeros.
-    return AsyncVectorEnv(factories, autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED)
+    return kind(factories, autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED)
 
 
 def last_observation(env: VectorEnv, observation: Any, info: Info, done: NDArray[np.bool_]) -> Any:

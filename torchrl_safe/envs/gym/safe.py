@@ -236,9 +236,12 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
     Keyword Args:
         cost_keys (Sequence[NestedKey], optional): the entries of ``info`` that are costs.
             Defaults to ``("cost",)``.
-        num_envs (int, optional): number of processes with an environment each. Defaults to ``0``:
-            one environment in this process, without a batch dimension. TorchRL's ``num_workers``
-            acts on its own ``GymEnv`` only; :class:`~torchrl.envs.ParallelEnv` does the same.
+        num_envs (int, optional): number of environments in a batch. Defaults to ``0``: one
+            environment without a batch dimension. TorchRL's ``num_workers`` acts on its own
+            ``GymEnv`` only; :class:`~torchrl.envs.ParallelEnv` does the same.
+        asynchronous (bool, optional): with ``num_envs``, whether each environment has a process of
+            its own. If not they step one after the other in this process, which is faster for
+            those whose step takes less than about a millisecond. Defaults to ``True``.
         **kwargs: arguments of :class:`~torchrl.envs.GymEnv` and of the environment.
 
     Examples:
@@ -249,7 +252,8 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
         >>> env.close()
     """
 
-    def __init__(self, env_name: str, **kwargs: Any) -> None:
+    def __init__(self, env_name: str, *, asynchronous: bool = True, **kwargs: Any) -> None:
+        self._asynchronous = asynchronous
         super().__init__(env_name, **{"backend": "gymnasium", **kwargs})
 
     @property
@@ -262,9 +266,9 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
         return super()._build_env(name, **kwargs)
 
     def _async_env(self, factories: Sequence[Callable[[], gymnasium.Env]]) -> Any:
-        if self._maker is gymnasium:
-            return autoreset.async_vector_env(factories)
-        return safety_gymnasium.async_vector_env(factories)
+        # TorchRL calls it for any number of environments, also for those of this process.
+        maker = autoreset if self._maker is gymnasium else safety_gymnasium
+        return maker.vector_env(factories, asynchronous=self._asynchronous)
 
 
 def _make(make: Callable[..., gymnasium.Env], env_name: str, **kwargs: Any) -> gymnasium.Env:

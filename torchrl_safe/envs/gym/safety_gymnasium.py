@@ -29,10 +29,10 @@ def find_maker(env_name: str) -> tuple[ModuleType, str]:
     return gymnasium, f"{_MODULE}:{name}" if name in gymnasium.registry else env_name
 
 
-def async_vector_env(
-    factories: Sequence[Callable[[], gymnasium.Env]],
+def vector_env(
+    factories: Sequence[Callable[[], gymnasium.Env]], *, asynchronous: bool
 ) -> gymnasium.vector.VectorEnv:
-    """A process for each environment whose ``step`` returns six values."""
-    from safety_gymnasium.vector import SafetyAsyncVectorEnv
+    """Several environments whose ``step`` returns six values."""
+    from safety_gymnasium.vector import SafetyAsyncVectorEnv, SafetySyncVectorEnv
 
-    return SafetyAsyncVectorEnv(factories)
+    return (SafetyAsyncVectorEnv if asynchronous else SafetySyncVectorEnv)(factories)

@@ -1,0 +1,481 @@
+"""Trains a policy within cost limits, in any Gymnasium environment that reports a cost.
+
+::
+
+    python -m experiments.safe_gym --env SafetySwimmerVelocity-v1 --cost-limit 25
+
+The whole recipe is in this file, to be copied and changed. Sizes do not matter: observations are
+standardized, advantages and multiplier have no unit, and critics predict in units of their targets.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from time import strftime
+from typing import Any, Literal, NamedTuple
+
+import torch
+import tyro
+from tensordict import TensorDictBase
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torch import Tensor
+from torch.distributions import kl_divergence
+from torchrl.collectors import Collector
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import EnvBase, RewardSum
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import LossModule, ValueEstimators
+from tqdm import tqdm
+
+from experiments.algorithms import ALGORITHMS, OnPolicy
+from experiments.files import is_new, write_whole
+from experiments.log import Log, figures, versions
+from torchrl_safe.checkpoint import RunCheckpoints
+from torchrl_safe.envs.gym import SafeGymEnv
+from torchrl_safe.evaluation import evaluate, summarize
+from torchrl_safe.objectives import (
+    DualAscent,
+    MultiplierUpdater,
+    TrustRegionStep,
+    ViolationUpdater,
+)
+from torchrl_safe.policy import save_policy
+
+# What may be another when a run is resumed: it changes nothing in what is learnt.
+CHANGEABLE = ("out", "logger", "resume", "compile", "eval_episodes")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train a policy within cost limits, in a Gymnasium environment that reports a cost."""
+
+    env: str
+    """Name of the environment, of Gymnasium or Safety-Gymnasium; "module:name" imports a module
+    first."""
+    cost_keys: tuple[str, ...] = ("cost",)
+    """Entries of info that are costs; "costs.collision" is an entry of an entry."""
+    cost_limit: tuple[float, ...] = (25.0,)
+    """Limit of the expected cost of an episode: one number, or one for each cost."""
+    algorithm: Literal[
+        "ppo", "ppo-lagrangian", "kl-ppo-lagrangian", "a2c-lagrangian", "trpo", "trpo-lagrangian",
+        "cpo", "pcpo", "focops", "cup", "p3o", "ipo", "crpo",
+    ] = "ppo-lagrangian"  # fmt: skip
+    """What to train with; ppo and trpo know no costs."""
+    frames: int = 1_000_000
+    """Steps to train for."""
+    envs: int = 8
+    """Environments that step side by side."""
+    asynchronous: bool = False
+    """Give each environment a process of its own: faster if a step takes milliseconds."""
+    seed: int = 0
+    """Seed of networks, environments and minibatches."""
+    out: Path = dataclasses.field(
+        default_factory=lambda: Path("runs", strftime("%Y-%m-%d_%H-%M-%S"))
+    )
+    """Folder for logs, checkpoints, policy.pt and results.json; named by date and time."""
+    logger: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
+    """TorchRL logger; all but csv are to be installed by you."""
+    resume: bool = False
+    """Go on with the run in the folder where it was stopped, with the settings it has; if there
+    is none, begin it."""
+    checkpoint_every: int = 10
+    """Batches between two checkpoints. At each, all episodes begin anew."""
+    eval_episodes: int = 50
+    """Episodes of the final evaluation, with the deterministic policy."""
+    compile: bool = True
+    """Compile the loss: half a minute at the start, then updates take a third of the time. Needs
+    a C++ compiler."""
+    frames_per_batch: int = 8_000
+    """Steps between two updates of the policy: some whole episodes at least."""
+    epochs: int = 40
+    """Passes over each batch at most."""
+    max_kl: float = 0.02
+    """Divergence from the policy that collected the batch, after which its passes end; the size of
+    the step in a trust region."""
+    minibatch: int = 64
+    """Steps in a minibatch."""
+    learning_rate: float = 3e-4
+    """Adam's learning rate at the start; it falls linearly to 0."""
+    max_grad_norm: float = 0.5
+    """Largest norm of the policy's gradient."""
+    log_std: float = -0.5
+    """Logarithm of the policy's deviation at the start, before the squashing; it is learnt."""
+    gamma: float = 0.99
+    """Discount of reward and costs."""
+
+    def __post_init__(self) -> None:
+        counts = ("frames", "envs", "checkpoint_every", "eval_episodes", "frames_per_batch")
+        for name in (*counts, "epochs", "minibatch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        for name in ("max_kl", "learning_rate", "max_grad_norm"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        if not 0 < self.gamma < 1:
+            raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
+        if not all(0 <= limit < math.inf for limit in self.cost_limit):
+            raise ValueError(f"cost_limit must not be negative, got {self.cost_limit}.")
+        if len(self.cost_limit) not in (1, len(self.cost_keys)):
+            raise ValueError(
+                f"cost_limit must be one number or one for each of {self.cost_keys}, got "
+                f"{self.cost_limit}."
+            )
+        if self.frames_per_batch % self.envs or self.frames_per_batch < self.minibatch:
+            raise ValueError(
+                f"frames_per_batch must be a multiple of envs and at least a minibatch, got "
+                f"{self.frames_per_batch}, {self.envs} and {self.minibatch}."
+            )
+
+
+class Standardize(torch.nn.Module):
+    """Brings observations to mean 0 and deviation 1, by all that were shown to :meth:`update`.
+
+    As a layer of the networks it is saved with them, and nothing changes it while they are
+    evaluated.
+    """
+
+    mean: Tensor
+    std: Tensor
+    count: Tensor
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(width, dtype=torch.float64))
+        self.register_buffer("std", torch.ones(width, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, observation: Tensor) -> None:
+        """Adds observations, shape ``(*B, width)``, to those that were shown before."""
+        rows = observation.reshape(-1, observation.shape[-1]).double()
+        share = len(rows) / (self.count + len(rows))
+        var, mean = torch.var_mean(rows, 0, correction=0)
+        between = share * (1 - share) * (mean - self.mean).square()
+        var = self.std.square().lerp(var, share) + between
+        self.std.copy_(var.sqrt().clamp_min(1e-8))
+        self.mean.lerp_(mean, share)
+        self.count.add_(len(rows))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return ((observation - self.mean) / self.std).clamp(-10, 10).float()
+
+
+class Critic(torch.nn.Module):
+    """Predicts values in units of their targets, so that the size of these does not matter.
+
+    Its outputs stay what they were when the units change: PopArt, van Hasselt et al. 2016,
+    https://arxiv.org/abs/1602.07714.
+    """
+
+    mean: Tensor
+    std: Tensor
+    changes: Tensor
+
+    def __init__(self, standardize: Standardize, values: int) -> None:
+        super().__init__()
+        self.standardize = standardize
+        self.net = small_network(len(standardize.mean), values)
+        self.register_buffer("mean", torch.zeros(values))
+        self.register_buffer("std", torch.ones(values))
+        self.register_buffer("changes", torch.zeros(()))
+
+    @torch.no_grad()
+    def change_units(self, targets: Tensor) -> None:
+        """Takes mean and deviation of value targets, shape ``(*B, values)``, for units."""
+        std, mean = torch.std_mean(targets.flatten(0, -2), 0)
+        # A critic of costs that have become rare is not to magnify its own noise.
+        std = torch.maximum(std, self.std.lerp(std, 0.02)) if self.changes else std
+        std = torch.where(std > 0, std, self.std)
+        last, ratio = self.net[-1], self.std / std
+        last.weight.mul_(ratio[:, None])
+        last.bias.mul_(ratio).add_((self.mean - mean) / std)
+        self.mean.copy_(mean)
+        self.std.copy_(std)
+        self.changes.add_(1)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        values = self.net(self.standardize(observation))
+        # What a squared error in the targets' unit brings back is std ** 2 times too much.
+        values = values.detach().lerp(values, self.std**-2)
+        return self.mean + self.std * values
+
+
+class Explorer(torch.nn.Module):
+    """Draws actions from a policy as TanhNormal does; without its object that is twice as fast."""
+
+    def __init__(self, policy: torch.nn.Module, bounds: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.policy, self.bounded = policy, bool(bounds)
+        if bounds:
+            self.register_buffer("centre", (bounds["high"] + bounds["low"]) / 2)
+            self.register_buffer("radius", (bounds["high"] - bounds["low"]) / 2)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        loc, scale = self.policy(observation)
+        drawn = loc + scale * torch.randn_like(loc)
+        # TanhNormal keeps as far from the bounds, where the logarithm of the density is infinite.
+        limit = 1 - 1e-6
+        return (
+            self.centre + self.radius * drawn.tanh().clamp(-limit, limit) if self.bounded else drawn
+        )
+
+
+class Agent(NamedTuple):
+    """A policy and two critics, which share the statistics of observations."""
+
+    standardize: Standardize
+    explorer: TensorDictModule
+    actor: ProbabilisticActor
+    critic: ValueOperator
+    cost_critic: ValueOperator
+
+
+def small_network(inputs: int, outputs: int) -> MLP:
+    """Two hidden layers of 64 that give nearly the same everywhere to start with."""
+    net = MLP(inputs, outputs, num_cells=[64, 64], activation_class=torch.nn.Tanh)
+    torch.nn.init.orthogonal_(net[-1].weight, 0.01)
+    torch.nn.init.zeros_(net[-1].bias)
+    return net
+
+
+def make_agent(env: EnvBase, log_std: float) -> Agent:
+    """Makes the networks for an environment."""
+    observation, action = env.observation_spec_unbatched["observation"], env.action_spec_unbatched
+    if observation.ndim != 1 or not isinstance(action, Bounded | Unbounded):
+        raise ValueError(
+            "env must have a vector for an observation and continuous actions, got "
+            f"{observation} and {action}."
+        )
+    standardize, actions = Standardize(observation.shape[0]), action.shape[0]
+    policy = torch.nn.Sequential(
+        standardize,
+        small_network(observation.shape[0], actions),
+        AddStateIndependentNormalScale(actions, init_value=log_std),
+    )
+    bounds = {}
+    if isinstance(action, Bounded):
+        bounds = {"low": action.space.low, "high": action.space.high}
+    actor = ProbabilisticActor(
+        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal if bounds else IndependentNormal,
+        distribution_kwargs={**bounds, "tanh_loc": False} if bounds else {},
+    )
+    costs = env.reward_spec["cost"].shape[-1]
+    return Agent(
+        standardize,
+        TensorDictModule(Explorer(policy, bounds), ["observation"], ["action"]),
+        actor,
+        ValueOperator(Critic(standardize, 1), ["observation"], ["state_value"]),
+        ValueOperator(Critic(standardize, costs), ["observation"], ["cost_value"]),
+    )
+
+
+def make_env(config: Config) -> EnvBase:
+    """Makes the environments, with sums of reward and costs over each episode."""
+    env = SafeGymEnv(
+        config.env,
+        cost_keys=[tuple(key.split(".")) for key in config.cost_keys],
+        num_envs=config.envs if config.envs > 1 else 0,
+        asynchronous=config.asynchronous,
+    )
+    return env.append_transform(RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
+
+
+def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | ViolationUpdater | None:
+    """Makes what tells the loss of the episode costs of each batch."""
+    if config.algorithm in ("ppo", "trpo"):
+        return None
+    limits = torch.tensor(config.cost_limit)
+    if "lagrange_multiplier" in loss.cost_buffers:
+        return DualAscent(loss, cost_limit=limits, lr=0.4, normalize=True, pessimism=2.0)
+    return ViolationUpdater(loss, cost_limit=limits)
+
+
+class Learner:
+    """Goes through each batch in minibatches, until the policy is ``max_kl`` from what it was."""
+
+    def __init__(self, config: Config, agent: Agent, batches: int) -> None:
+        algorithm = ALGORITHMS[config.algorithm]
+        assert isinstance(algorithm, OnPolicy)
+        self.config, self.agent = config, agent
+        networks = agent.actor, agent.critic, agent.cost_critic
+        self.loss = algorithm.loss(*networks, num_costs=len(config.cost_keys))
+        discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
+        self.loss.make_value_estimator(ValueEstimators.GAE, **discount)
+        self.loss.make_cost_value_estimator(**discount)
+        self.policy = list(agent.actor.parameters())
+        self.optimizer = torch.optim.Adam(
+            self.loss.parameters(), lr=config.learning_rate, fused=True
+        )
+        self.schedule = torch.optim.lr_scheduler.LinearLR(
+            self.optimizer, 1.0, 0.0, total_iters=batches
+        )
+        self.step = None
+        if algorithm.method is not None:
+            self.step = TrustRegionStep(self.loss, algorithm.method, max_kl=config.max_kl)
+        self.epochs = algorithm.epochs or config.epochs
+        objective = self.loss if self.step is None else self.loss.critic_losses
+        self.objective = self._summed(objective)
+        # CUP has a second phase.
+        self.projection = self._summed(self.loss.projection_loss) if algorithm.projects else None
+
+    def learn(self, batch: TensorDictBase) -> float:
+        """Learns from a batch as the collector returns it; returns how far the policy moved."""
+        actor = self.agent.actor
+        with torch.no_grad():  # Once for the batch, not in each step.
+            before = actor.get_dist(batch)
+            batch["action_log_prob"] = before.log_prob(batch["action"])
+        self.loss.estimate_advantages(batch)
+        self.agent.critic.module.change_units(batch["value_target"])
+        self.agent.cost_critic.module.change_units(batch["cost_value_target"])
+        data = batch.reshape(-1)
+        if self.step is not None:
+            self.step.step(data)
+        for epoch in range(self.epochs):
+            for minibatch in self._minibatches(data):
+                self._descend(self.objective(minibatch))
+            with torch.no_grad():
+                kl = kl_divergence(before, actor.get_dist(batch)).mean().item()
+            if not math.isfinite(kl):
+                raise ValueError(f"The policy is not finite after pass {epoch}.")
+            if kl > self.config.max_kl and self.step is None:
+                break
+        if self.projection is not None:
+            self.loss.start_projection()
+            for _ in range(epoch + 1):
+                for minibatch in self._minibatches(data):
+                    self._descend(self.projection(minibatch))
+        self.schedule.step()
+        # Last: the policy that collected the batch is the one that learnt from it.
+        self.agent.standardize.update(batch["observation"])
+        return kl
+
+    def _summed(self, loss: Callable[..., TensorDictBase]) -> Callable[[TensorDictBase], Tensor]:
+        def total(minibatch: TensorDictBase) -> Tensor:
+            return sum(v for k, v in loss(minibatch).items() if k.startswith("loss_"))
+
+        return torch.compile(total, dynamic=False) if self.config.compile else total
+
+    def _minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
+        # Each pass leaves out others of the steps that do not fill a minibatch.
+        size = self.config.minibatch
+        order = torch.randperm(len(data))[: len(data) // size * size]
+        yield from data.select(*self.loss.in_keys, strict=False)[order].split(size)
+
+    def _descend(self, loss: Tensor) -> None:
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.policy, self.config.max_grad_norm)
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+
+
+def begin_episodes(config: Config, collector: Collector, frames: int) -> None:
+    """Begins all episodes anew; what follows depends on the seed and on ``frames`` only.
+
+    Gymnasium's environments cannot be saved. So that a resumed run is the same as one that was
+    never stopped, both do this at every checkpoint.
+    """
+    seed = config.seed * 100_000_000 + frames
+    torch.manual_seed(seed)
+    collector.set_seed(seed)
+    collector.reset()
+
+
+def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
+    """Trains, and writes the policy; returns the networks and the figures of each batch."""
+    torch.set_num_threads(1)  # The networks are small: more only wait for each other.
+    torch.manual_seed(config.seed)
+    env = make_env(config)
+    env.set_seed(config.seed)
+    agent = make_agent(env, config.log_std)
+    with torch.no_grad():  # Something to begin with.
+        random = env.rollout(max(1, 1000 // config.envs), break_when_any_done=False)
+    agent.standardize.update(random["observation"])
+    batches = math.ceil(config.frames / config.frames_per_batch)
+    learner = Learner(config, agent, batches)
+    loss, updater = learner.loss, make_updater(config, learner.loss)
+    log = Log(config.logger, config.out / "logs", config.algorithm)
+    state = {
+        "agent": torch.nn.ModuleList(agent),
+        "loss": loss,
+        "optimizer": learner.optimizer,
+        "schedule": learner.schedule,
+        "updater": updater,
+        "step": learner.step,
+        "log": log,
+    }
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in CHANGEABLE}
+    checkpoints = RunCheckpoints(
+        config.out / "checkpoints",
+        {name: part for name, part in state.items() if part is not None},
+        settings=settings,
+    )
+    if config.resume:
+        checkpoints.load()
+    else:
+        checkpoints.clear()
+    log.open()
+    collector = Collector(
+        env,
+        agent.explorer,
+        frames_per_batch=config.frames_per_batch,
+        total_frames=-1,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
+    begin_episodes(config, collector, log.frames)
+    with tqdm(total=config.frames, unit="frame", unit_scale=True, disable=not progress) as bar:
+        bar.update(log.frames)
+        for batch in islice(collector, batches - len(log.rows)):
+            episodes = batch["next"][batch["next", "done"].squeeze(-1)]
+            if updater is not None:
+                updater.step(episodes["episode_cost"])
+            kl = learner.learn(batch)
+            row = {**figures(episodes, loss, config.cost_keys), "kl": kl}
+            bar.update(batch.numel())
+            bar.set_postfix({name: f"{value:.3g}" for name, value in row.items()})
+            log.add({"frames": log.frames + batch.numel(), **row})
+            if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
+                checkpoints.save(log.frames)
+                begin_episodes(config, collector, log.frames)
+    kept = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    save_policy(
+        config.out / "policy.pt", agent.actor, env.observation_spec_unbatched, settings=kept
+    )
+    collector.shutdown()
+    return agent, log
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Trains, evaluates, and writes the results."""
+    if not config.resume and not is_new(config.out):
+        raise FileExistsError(
+            f"out must be a new or empty folder, or with resume that of a run, got "
+            f"{str(config.out)!r}."
+        )
+    agent, log = train(config)
+    seconds = log.seconds
+    env = make_env(config)  # Seeds that training does not use; the statistics are frozen.
+    episodes = evaluate(env, agent.actor, config.eval_episodes, seed=config.seed + 10_000_000_000)
+    env.close()
+    results = {
+        "config": dataclasses.asdict(config),
+        "versions": versions(),
+        "seconds": seconds,
+        "history": log.rows,
+        "evaluation": summarize(episodes, config.cost_keys),
+    }
+    write_whole(config.out / "results.json", json.dumps(results, indent=1, default=str))
+    print(json.dumps(results["evaluation"], indent=1))
+    print(f"Results and policy are in {config.out}.")
+    return results
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
