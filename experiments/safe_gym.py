@@ -32,7 +32,7 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNorm
 from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
 
-from experiments.algorithms import ALGORITHMS, OnPolicy
+from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
 from experiments.files import is_new, write_whole
 from experiments.log import Log, figures, versions
 from torchrl_safe.checkpoint import RunCheckpoints
@@ -103,6 +103,8 @@ class Config:
     """Adam's learning rate at the start; it falls linearly to 0."""
     max_grad_norm: float = 0.5
     """Largest norm of the policy's gradient."""
+    random_frames: int = 1_000
+    """Steps of random actions before all others, for the first statistics of observations."""
     log_std: float = -0.5
     """Logarithm of the policy's deviation at the start, before the squashing; it is learnt."""
     gamma: float = 0.99
@@ -110,7 +112,7 @@ class Config:
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "checkpoint_every", "eval_episodes", "frames_per_batch")
-        for name in (*counts, "epochs", "minibatch"):
+        for name in (*counts, "epochs", "minibatch", "random_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
         for name in ("max_kl", "learning_rate", "max_grad_norm"):
@@ -146,7 +148,7 @@ class Standardize(torch.nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(width, dtype=torch.float64))
-        self.register_buffer("std", torch.ones(width, dtype=torch.float64))
+        self.register_buffer("std", torch.ones(width))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()
@@ -156,13 +158,13 @@ class Standardize(torch.nn.Module):
         share = len(rows) / (self.count + len(rows))
         var, mean = torch.var_mean(rows, 0, correction=0)
         between = share * (1 - share) * (mean - self.mean).square()
-        var = self.std.square().lerp(var, share) + between
+        var = self.std.double().square().lerp(var, share) + between
         self.std.copy_(var.sqrt().clamp_min(1e-8))
         self.mean.lerp_(mean, share)
         self.count.add_(len(rows))
 
     def forward(self, observation: Tensor) -> Tensor:
-        return ((observation - self.mean) / self.std).clamp(-10, 10).float()
+        return ((observation - self.mean) / self.std).clamp(-10, 10).to(self.std.dtype)
 
 
 class Critic(torch.nn.Module):
@@ -289,10 +291,10 @@ def make_env(config: Config) -> EnvBase:
 
 def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | ViolationUpdater | None:
     """Makes what tells the loss of the episode costs of each batch."""
-    if config.algorithm in ("ppo", "trpo"):
+    wanted, limits = ALGORITHMS[config.algorithm].updater, torch.tensor(config.cost_limit)
+    if wanted is keep_multiplier:
         return None
-    limits = torch.tensor(config.cost_limit)
-    if "lagrange_multiplier" in loss.cost_buffers:
+    if wanted is move_multiplier:
         return DualAscent(loss, cost_limit=limits, lr=0.4, normalize=True, pessimism=2.0)
     return ViolationUpdater(loss, cost_limit=limits)
 
@@ -334,7 +336,7 @@ class Learner:
         self.loss.estimate_advantages(batch)
         self.agent.critic.module.change_units(batch["value_target"])
         self.agent.cost_critic.module.change_units(batch["cost_value_target"])
-        data = batch.reshape(-1)
+        data = batch.exclude("next").reshape(-1)
         if self.step is not None:
             self.step.step(data)
         for epoch in range(self.epochs):
@@ -366,7 +368,7 @@ class Learner:
         # Each pass leaves out others of the steps that do not fill a minibatch.
         size = self.config.minibatch
         order = torch.randperm(len(data))[: len(data) // size * size]
-        yield from data.select(*self.loss.in_keys, strict=False)[order].split(size)
+        yield from data[order].split(size)
 
     def _descend(self, loss: Tensor) -> None:
         loss.backward()
@@ -388,14 +390,16 @@ def begin_episodes(config: Config, collector: Collector, frames: int) -> None:
 
 
 def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
-    """Trains, and writes the policy; returns the networks and the figures of each batch."""
+    """Trains; returns the networks and the figures of each batch."""
     torch.set_num_threads(1)  # The networks are small: more only wait for each other.
     torch.manual_seed(config.seed)
     env = make_env(config)
     env.set_seed(config.seed)
     agent = make_agent(env, config.log_std)
-    with torch.no_grad():  # Something to begin with.
-        random = env.rollout(max(1, 1000 // config.envs), break_when_any_done=False)
+    with torch.no_grad():
+        random = env.rollout(
+            math.ceil(config.random_frames / config.envs), break_when_any_done=False
+        )
     agent.standardize.update(random["observation"])
     batches = math.ceil(config.frames / config.frames_per_batch)
     learner = Learner(config, agent, batches)
@@ -444,10 +448,6 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
                 checkpoints.save(log.frames)
                 begin_episodes(config, collector, log.frames)
-    kept = json.loads(json.dumps(dataclasses.asdict(config), default=str))
-    save_policy(
-        config.out / "policy.pt", agent.actor, env.observation_spec_unbatched, settings=kept
-    )
     collector.shutdown()
     return agent, log
 
@@ -461,7 +461,12 @@ def main(config: Config) -> dict[str, Any]:
         )
     agent, log = train(config)
     seconds = log.seconds
-    env = make_env(config)  # Seeds that training does not use; the statistics are frozen.
+    env = make_env(config)
+    kept = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    save_policy(
+        config.out / "policy.pt", agent.actor, env.observation_spec_unbatched, settings=kept
+    )
+    # Seeds that training does not use. The statistics of observations stay as they are.
     episodes = evaluate(env, agent.actor, config.eval_episodes, seed=config.seed + 10_000_000_000)
     env.close()
     results = {

@@ -91,9 +91,13 @@ def test_made_by_gymnasium(make_env, mode):
     check_counts(env.rollout(5, break_when_any_done=False), [2, 2, 2])
 
 
-def test_made_by_name_and_vectorized(make_env, forked_workers):
+@pytest.mark.parametrize("asynchronous", [True, False])
+def test_made_by_name_and_vectorized(make_env, forked_workers, asynchronous):
     """TorchRL's own GymEnv returns zeros for the last observations here."""
-    env = make_env(SafeGymEnv, "counting:Counting-v0", num_envs=2, steps=4)
+    env = make_env(
+        SafeGymEnv, "counting:Counting-v0", num_envs=2, asynchronous=asynchronous, steps=4
+    )
+    assert isinstance(env.unwrapped, AsyncVectorEnv if asynchronous else SyncVectorEnv)
     check_counts(env.rollout(9, break_when_any_done=False), [4, 4])
 
 

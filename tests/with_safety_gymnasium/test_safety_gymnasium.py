@@ -159,8 +159,11 @@ def test_rows_that_end_apart(make_env):
 
 
 @both
-def test_vectorized_by_name(make_env, forked_workers, name):
-    env = make_env(SafeGymEnv, name, num_envs=2, max_episode_steps=EPISODE)
+@pytest.mark.parametrize("asynchronous", [True, False])
+def test_vectorized_by_name(make_env, forked_workers, name, asynchronous):
+    env = make_env(
+        SafeGymEnv, name, num_envs=2, asynchronous=asynchronous, max_episode_steps=EPISODE
+    )
     assert env.batch_size == (2,)
     actions = swim(2)
     check_same(replay(env, 1, actions), rows(SWIMMER, 1, actions))

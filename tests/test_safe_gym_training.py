@@ -1,0 +1,284 @@
+"""`python -m experiments.safe_gym`: the recipe for any Gymnasium environment with a cost."""
+
+import json
+from dataclasses import replace
+from typing import get_args, get_type_hints
+
+import numpy as np
+import pytest
+import torch
+from torch.distributions import kl_divergence
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from experiments import safe_gym
+from experiments.safe_gym import Config, Critic, Standardize, main, make_agent, make_env, train
+from torchrl_safe.policy import load_policy
+
+# Two episodes in each of two environments.
+SMALL = Config(
+    env="sliding:Slide-v0",
+    cost_limit=(0.5,),
+    frames=400,
+    frames_per_batch=80,
+    envs=2,
+    epochs=2,
+    minibatch=16,
+    eval_episodes=4,
+    checkpoint_every=2,
+    random_frames=100,
+    compile=False,
+)
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def weights(agent):
+    return torch.nn.ModuleList(agent).state_dict()
+
+
+def test_the_results_and_the_policy(tmp_path):
+    results = main(replace(SMALL, out=tmp_path))
+    assert json.loads((tmp_path / "results.json").read_text())["history"] == results["history"]
+    assert [row["frames"] for row in results["history"]] == [80, 160, 240, 320, 400]
+    assert set(results["evaluation"]) == {"return", "steps", "cost/cost", "any/cost"}
+    assert results["evaluation"]["steps"] == [20, 20, 20]
+    assert (tmp_path / "logs" / "ppo-lagrangian").is_dir()
+    policy = load_policy(tmp_path / "policy.pt")
+    assert policy.settings["env"] == SMALL.env
+    # Its environment's own observations, far from 0 and of double precision.
+    assert policy.observation_dtype == np.float64
+    assert abs(policy(np.array([1000.0, 0.0]))).item() < 2
+    assert policy(np.array([900.0, 0.0])) != policy(np.array([1100.0, 0.0]))
+
+
+def test_a_stopped_run_goes_on_bit_for_bit(tmp_path, monkeypatch):
+    whole, log = train(replace(SMALL, out=tmp_path / "whole"), progress=False)
+    stopped = replace(SMALL, out=tmp_path / "stopped")
+    with monkeypatch.context() as patch:
+        add = safe_gym.Log.add
+
+        def stop_in_the_fourth_batch(self, row):
+            if len(self.rows) == 3:
+                raise KeyboardInterrupt
+            add(self, row)
+
+        patch.setattr(safe_gym.Log, "add", stop_in_the_fourth_batch)
+        with pytest.raises(KeyboardInterrupt):
+            train(stopped, progress=False)
+    with pytest.raises(FileExistsError, match="resume"):
+        main(stopped)
+    agent, again = train(replace(stopped, resume=True), progress=False)
+    assert again.rows == log.rows
+    for name, value in weights(whole).items():
+        assert torch.equal(weights(agent)[name], value), name
+
+
+def test_statistics_are_of_all_observations_and_frozen_in_evaluation(tmp_path, monkeypatch):
+    shown = []
+    update = Standardize.update
+
+    def remember(self, observation):
+        shown.append(observation.reshape(-1, 2).double())
+        update(self, observation)
+
+    monkeypatch.setattr(Standardize, "update", remember)
+    agent, _ = train(replace(SMALL, out=tmp_path), progress=False)
+    seen = torch.cat(shown)
+    assert len(seen) == SMALL.random_frames + SMALL.frames
+    torch.testing.assert_close(agent.standardize.mean, seen.mean(0))
+    torch.testing.assert_close(agent.standardize.std, seen.std(0, correction=0).float())
+    before = agent.standardize.mean.clone()
+    env = make_env(SMALL)
+    safe_gym.evaluate(env, agent.actor, 2, seed=0)
+    env.close()
+    assert torch.equal(agent.standardize.mean, before)
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    [name for name in get_args(get_type_hints(Config)["algorithm"]) if name != "ppo-lagrangian"],
+)
+def test_algorithms(tmp_path, algorithm):
+    config = replace(SMALL, algorithm=algorithm, frames=80, epochs=1, out=tmp_path)
+    fresh = make_agent_of(config)
+    agent, log = train(config, progress=False)
+    assert len(log.rows) == 1
+    moved = [
+        not torch.equal(before, after)
+        for before, after in zip(fresh.actor.parameters(), agent.actor.parameters(), strict=True)
+    ]
+    assert all(moved)
+    assert ("multiplier/cost" in log.rows[0]) == (
+        algorithm not in ("cpo", "pcpo", "p3o", "ipo", "crpo")
+    )
+
+
+def make_agent_of(config):
+    torch.manual_seed(config.seed)
+    env = make_env(config)
+    agent = make_agent(env, config.log_std)
+    env.close()
+    return agent
+
+
+def test_several_costs(tmp_path):
+    config = replace(
+        SMALL,
+        cost_keys=("costs.fast", "costs.far"),
+        cost_limit=(0.5, 2.0),
+        frames=160,
+        out=tmp_path,
+    )
+    results = main(config)
+    for name in config.cost_keys:
+        assert f"cost/{name}" in results["evaluation"]
+        assert f"multiplier/{name}" in results["history"][-1]
+
+
+def test_on_our_own_arm(tmp_path):
+    config = replace(
+        SMALL,
+        env="torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0",
+        cost_keys=("costs.collision",),
+        frames=160,
+        eval_episodes=1,
+        out=tmp_path,
+    )
+    results = main(config)
+    assert results["evaluation"]["steps"] == [40, 40, 40]
+    assert load_policy(tmp_path / "policy.pt").observation_shape == (40,)
+
+
+def test_one_environment(tmp_path):
+    _, log = train(replace(SMALL, envs=1, frames=80, out=tmp_path), progress=False)
+    assert len(log.rows) == 1
+
+
+def test_the_size_of_rewards_costs_and_limit_does_not_matter(tmp_path):
+    agents, logs = zip(
+        train(replace(SMALL, out=tmp_path / "one"), progress=False),
+        train(
+            replace(
+                SMALL, env="sliding:SlideScaled-v0", cost_limit=(512.0,), out=tmp_path / "other"
+            ),
+            progress=False,
+        ),
+        strict=True,
+    )
+    one, other = (log.rows[-1] for log in logs)
+    assert other["return"] == pytest.approx(128 * one["return"], rel=1e-3)
+    assert other["cost/cost"] == pytest.approx(1024 * one["cost/cost"], rel=1e-3)
+    assert one["multiplier/cost"] > 0
+    for (name, value), scaled in zip(
+        agents[0].actor.named_parameters(), agents[1].actor.parameters(), strict=True
+    ):
+        torch.testing.assert_close(scaled, value, rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_units_change_and_predictions_stay():
+    critic = Critic(Standardize(2), 2)
+    observation = torch.randn(50, 2, dtype=torch.float64)
+    for scale in (1.0, 1e3, 1e-3):
+        before = critic(observation)
+        targets = scale * (torch.randn(50, 2) + torch.tensor([3.0, 0.0]))
+        critic.change_units(targets)
+        torch.testing.assert_close(critic.mean, targets.mean(0))
+        # The rounding is that of the larger numbers.
+        largest = before.abs().max().item() + scale
+        torch.testing.assert_close(critic(observation), before, rtol=0, atol=1e-5 * largest)
+
+
+def test_units_of_costs_that_become_rare():
+    critic = Critic(Standardize(2), 1)
+    critic.change_units(torch.zeros(4, 1))
+    assert critic.std.item() == 1
+    targets = torch.tensor([[0.0], [2.0], [4.0], [6.0]])
+    critic.change_units(targets)
+    assert critic.mean.item() == 3
+    assert critic.std.item() == pytest.approx((20 / 3) ** 0.5)
+    critic.change_units(torch.zeros(4, 1))
+    assert critic.std.item() == pytest.approx(0.98 * (20 / 3) ** 0.5)
+
+
+def test_gradients_do_not_depend_on_the_unit():
+    gradients = []
+    for scale in (1.0, 1024.0):
+        torch.manual_seed(0)
+        critic = Critic(Standardize(2), 1)
+        observation, targets = torch.randn(50, 2), scale * torch.randn(50, 1)
+        critic.change_units(targets)
+        # The same prediction in these units.
+        critic.net[-1].weight.data.fill_(0.1)
+        critic.net[-1].bias.data.zero_()
+        (critic(observation) - targets).square().mean().backward()
+        gradients.append([parameter.grad for parameter in critic.parameters()])
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(other, one)
+
+
+def test_explores_as_the_policy(make_env):
+    env = make_env(safe_gym.make_env, SMALL)
+    agent = make_agent(env, 0.5)
+    tensordict = env.reset()
+    with set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(1)
+        drawn = torch.stack([agent.explorer(tensordict)["action"] for _ in range(20)])
+        torch.manual_seed(1)
+        expected = torch.stack([agent.actor(tensordict)["action"] for _ in range(20)])
+    torch.testing.assert_close(drawn, expected)
+    assert drawn.abs().max() > 1
+
+
+def test_passes_end_where_the_policy_is_far(tmp_path):
+    config = replace(SMALL, frames=80, epochs=1000, max_kl=0.01, learning_rate=0.003, out=tmp_path)
+    _, log = train(config, progress=False)
+    assert 0.01 < log.rows[0]["kl"] < 0.1
+
+
+def test_divergence_is_that_of_the_distributions(make_env):
+    env = make_env(safe_gym.make_env, SMALL)
+    tensordict = env.reset()
+    one, other = (make_agent(env, std).actor.get_dist(tensordict) for std in (0.0, 0.5))
+    divergence = kl_divergence(one, other)
+    assert divergence.shape == (2,)
+    drawn = one.sample((20_000,))
+    monte_carlo = (one.log_prob(drawn) - other.log_prob(drawn)).mean(0)
+    torch.testing.assert_close(divergence, monte_carlo, rtol=0.1, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cost_limit": (1.0, 2.0)}, "cost_limit must be one number or one for each"),
+        ({"cost_limit": (-1.0,)}, "cost_limit must not be negative"),
+        ({"frames_per_batch": 81}, "multiple of envs"),
+        ({"gamma": 1.0}, "gamma must be between 0 and 1"),
+        ({"max_kl": 0.0}, "max_kl must be positive"),
+        ({"epochs": 0}, "epochs must be at least 1"),
+    ],
+)
+def test_settings_that_make_no_sense(changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(SMALL, **changes)
+
+
+def test_actions_that_are_not_continuous(tmp_path):
+    with pytest.raises(ValueError, match="continuous actions"):
+        train(replace(SMALL, env="sliding:Discreet-v0", out=tmp_path), progress=False)
+
+
+@pytest.mark.slow
+def test_compiled_is_the_same(tmp_path):
+    agents = [
+        train(replace(SMALL, compile=compiled, out=tmp_path / str(compiled)), progress=False)[0]
+        for compiled in (False, True)
+    ]
+    for (name, value), compiled in zip(
+        agents[0].actor.named_parameters(), agents[1].actor.parameters(), strict=True
+    ):
+        torch.testing.assert_close(compiled, value, rtol=1e-3, atol=1e-4, msg=name)
