@@ -67,9 +67,8 @@ def test_the_spread_is_the_largest_so_far_slowly_forgotten():
     # Deviations of sqrt 800 twice, then of nothing: the second 11 counts by 0.9 sqrt 800 + 0.2.
     updater = make_updater(kp=0.0, ki=1.0)
     step(updater, -10.0, 30.0)
-    spread, exponents = math.sqrt(800), []
-    for _ in range(2):
-        exponents.append(step(updater, 11.0, 11.0).log1p().item())
+    spread = math.sqrt(800)
+    exponents = [step(updater, 11.0, 11.0).log1p().item() for _ in range(2)]
     assert exponents == pytest.approx([1 / spread, 1 / spread + 1 / (0.9 * spread + 0.1 * 2)])
 
 
