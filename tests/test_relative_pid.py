@@ -122,6 +122,22 @@ def test_rare_costs_are_judged_by_their_mean(chance, grows):
     assert min(seen[200:]) > 10 if grows else sum(seen[200:]) / 100 < 1
 
 
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+@pytest.mark.parametrize("cost", [0.0, 1e-38, 1e-9, 1e6, 3e20])
+def test_it_stays_finite_and_comes_back(cost, limit):
+    updater = make_updater(1.0, cost_limit=limit, pessimism=2.0)
+    spread = 0.5 + torch.rand(8, 1, generator=torch.Generator().manual_seed(0))
+    for episode_cost in (cost * spread, torch.tensor([[cost]])):
+        for _ in range(20):
+            updater.step(episode_cost)
+            assert 0 <= multiplier(updater).item() <= 100
+    if limit:
+        # The spread forgets a tenth in each batch: 3e20 in some 500.
+        for _ in range(700):
+            step(updater, 0.0, 0.0)
+        assert multiplier(updater).item() == 0
+
+
 def test_each_cost_for_itself():
     both = make_updater(0.0, 3.0, cost_limit=torch.tensor([1.0, 50.0]))
     alone = [make_updater(0.0, cost_limit=1.0), make_updater(3.0, cost_limit=50.0)]

@@ -15,7 +15,6 @@ def scaled_advantages(
     cost_scale: Tensor | None = None,
     counted: Tensor | None = None,
     standardize: bool = True,
-    centre: bool = True,
     exclude_dims: Sequence[int] = (),
 ) -> tuple[Tensor, Tensor]:
     r"""Scales the advantages of a whole batch: this is where all on-policy losses do it.
@@ -49,8 +48,8 @@ def scaled_advantages(
             ``(k,)``; one of 0 divides nothing. Defaults to ``None``, the unit of the cost.
         counted (Tensor, optional): the steps that count, bool, shape ``(*B, 1)``. Defaults to
             ``None``, all of them.
-        standardize (bool, optional): whether the reward advantage is. Defaults to ``True``.
-        centre (bool, optional): whether those of the costs are. Defaults to ``True``.
+        standardize (bool, optional): whether the reward advantage is, ``False`` where something
+            else scales it. Defaults to ``True``.
         exclude_dims (sequence of int, optional): dimensions of the reward advantage that are
             standardized each on its own, such as that of the agents. Defaults to ``()``.
 
@@ -71,8 +70,7 @@ def scaled_advantages(
     """
     if standardize and advantage.numel() > 1:  # One alone has no deviation.
         advantage = standardized(advantage, counted, exclude_dims)
-    if centre:
-        cost_advantage = centred(cost_advantage, counted)
+    cost_advantage = centred(cost_advantage, counted)
     if cost_scale is not None:
         cost_advantage = cost_advantage / torch.where(cost_scale > 0, cost_scale, 1.0)
     return advantage, cost_advantage

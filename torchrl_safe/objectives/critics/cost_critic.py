@@ -112,8 +112,8 @@ class CostCritic(CostValues):
         They are scaled over the whole batch, as
         :func:`~torchrl_safe.objectives.scaled_advantages` says: the reward advantage is
         standardized (unless the loss has an ``advantage_norm``, which scales it instead), the cost
-        advantages are centred (by ``CostGAE``; another estimator decides for itself) and, with
-        ``normalize_cost_advantage``, divided by a scale that the loss keeps from batch to batch.
+        advantages are centred and, with ``normalize_cost_advantage``, divided by a scale that the
+        loss keeps from batch to batch.
         Steps that the loss leaves out, such as those that pad a trajectory
         (``("collector", "mask")``), do not count. A call of the loss with a batch without
         advantages does the same first.
@@ -142,8 +142,7 @@ class CostCritic(CostValues):
             params=self.critic_network_params.detach() if self.functional else None,
             target_params=self.target_critic_network_params,
         )
-        estimator = self.cost_value_estimator
-        estimator(
+        self.cost_value_estimator(
             data,
             params=self.cost_critic_network_params.detach() if self.functional else None,
             target_params=self.target_cost_critic_network_params,
@@ -156,8 +155,6 @@ class CostCritic(CostValues):
             cost_scale=self._next_cost_scale(cost_advantage, mask),
             counted=mask,
             standardize=self.advantage_norm is None,
-            # CostGAE has done so already, over every step: that is over too many under a mask.
-            centre=mask is not None and isinstance(estimator, CostGAE) and estimator.average_gae,
             exclude_dims=self.normalize_advantage_exclude_dims,
         )
         data.set(keys.advantage, advantage)
