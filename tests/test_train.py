@@ -121,10 +121,7 @@ def test_help_names_the_options(capsys):
 
 
 def test_multiplier_rules():
-    """An episode 2 above the limit: 0.1 times 2 / 9, with proportional control 5 times as much more.
-
-    (3 times 3 is the scale of one episode that costs 3.) Without units it is 1 above the limit.
-    """
+    """An episode 2 above the limit, which 3 times 3 normalizes; without units it is 1 above."""
     multiplier = {}
     for name, rule in MULTIPLIER_RULES.items():
         loss = make_training().loss
