@@ -37,6 +37,10 @@ class RelativePID(MultiplierUpdater):
     :math:`1 / (1 + \lambda)`, a constant violation takes the same share of that weight in each
     batch, whether the multiplier that keeps the limit is 0.1 or 10.
 
+    :math:`\sigma_J` is the largest of all batches so far, of which each new one forgets a fifth:
+    divided by its own alone, a batch with few costs would count for more than one with many, and
+    rare costs would exceed the limit on average.
+
     The multiplier is free of units only if the advantages are: make the loss with
     ``normalize_cost_advantage=True``, with which it says how many standard deviations of the
     reward advantage one standard deviation of the cost advantage is worth. Then costs and limit
@@ -71,6 +75,8 @@ class RelativePID(MultiplierUpdater):
         >>> loss.lagrange_multiplier  # exp(0.1 * 0.4 + 0.5 * 0.4) - 1
         tensor([0.2712, 0.2712])
     """
+
+    _forgotten = 0.2
 
     def __init__(
         self,
