@@ -32,6 +32,7 @@ from torchrl_safe.objectives import (
     P3OLoss,
     PIDControl,
     PPOLagrangianLoss,
+    RelativePID,
     SACLagrangianLoss,
     TD3LagrangianLoss,
     TrustRegionLoss,
@@ -41,13 +42,16 @@ from torchrl_safe.objectives import (
 )
 
 Updater = MultiplierUpdater | ViolationUpdater
-# Called as rule(loss, rate, cost_limit=, pessimism=, normalize=). The gains stand to each other
-# as in tests/test_constrained_optimum.py.
+# Called as rule(loss, rate, cost_limit=, pessimism=). The gains stand to each other as in
+# tests/test_constrained_optimum.py.
 MULTIPLIER_RULES: dict[str, Callable[..., MultiplierUpdater]] = {
-    "dual-ascent": lambda loss, rate, **settings: DualAscent(loss, lr=rate, **settings),
-    "pid": lambda loss, rate, **settings: PIDControl(
-        loss, kp=5 * rate, ki=rate, kd=5 * rate, smoothing=0.5, **settings
+    "dual-ascent": lambda loss, rate, **settings: DualAscent(
+        loss, lr=rate, normalize=True, **settings
     ),
+    "pid": lambda loss, rate, **settings: PIDControl(
+        loss, kp=5 * rate, ki=rate, kd=5 * rate, smoothing=0.5, normalize=True, **settings
+    ),
+    "relative-pid": lambda loss, rate, **settings: RelativePID(loss, **settings),
 }
 
 
@@ -90,7 +94,6 @@ def move_multiplier(loss: LossModule, config: Config) -> Updater | None:
         config.multiplier_rate,
         cost_limit=config.cost_limit,
         pessimism=config.pessimism,
-        normalize=True,
     )
 
 
@@ -118,7 +121,8 @@ class OnPolicy:
     """An algorithm that learns from each batch while it is fresh.
 
     Args:
-        loss: called as ``loss(actor, critic, cost_critic, num_costs=)``.
+        loss: called as ``loss(actor, critic, cost_critic, num_costs=)``, with a rule without
+            units also with ``normalize_cost_advantage=True``.
         updater: called as ``updater(loss, config)``.
         epochs: passes over a batch, if not those of the configuration.
         method: the step that a trust-region method takes with the actor.
@@ -138,7 +142,10 @@ class OnPolicy:
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
         agent = make_agent(env, gamma=config.gamma, log_std=config.first_log_std)
-        loss = self.loss(agent.actor, agent.critic, agent.cost_critic, num_costs=num_costs(env))
+        options = {"num_costs": num_costs(env)}
+        if self.updater is move_multiplier and config.multiplier_rule == "relative-pid":
+            options["normalize_cost_advantage"] = True
+        loss = self.loss(agent.actor, agent.critic, agent.cost_critic, **options)
         discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
         loss.make_value_estimator(ValueEstimators.GAE, **discount)
         loss.make_cost_value_estimator(**discount)
@@ -217,9 +224,9 @@ Algorithm = OnPolicy | OffPolicy
 def _wrapping(make: Callable[..., LossModule], parent: Callable[..., LossModule]) -> Any:
     """``make`` around TorchRL's loss ``parent``, as a function of actor and critics."""
 
-    def build(actor: Any, critic: Any, cost_critic: Any, *, num_costs: int) -> LossModule:
+    def build(actor: Any, critic: Any, cost_critic: Any, **options: Any) -> LossModule:
         wrapped = parent(actor, critic, entropy_bonus=False, loss_critic_type="l2")
-        return make(wrapped, cost_critic, num_costs=num_costs)
+        return make(wrapped, cost_critic, **options)
 
     return build
 

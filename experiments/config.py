@@ -30,7 +30,7 @@ AlgorithmName = Literal[
     "td3-lagrangian",
 ]
 Engine = Literal["bullet", "mujoco"]
-MultiplierRule = Literal["dual-ascent", "pid", "fixed"]
+MultiplierRule = Literal["dual-ascent", "pid", "relative-pid", "fixed"]
 #: The algorithms that learn from replay; they need bounded actions.
 OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
 
@@ -95,8 +95,8 @@ class Config:
     gamma: float = 0.97
     """Discount of reward and cost."""
     multiplier_rule: MultiplierRule = "dual-ascent"
-    """What moves the multiplier: the violations added up, also the last one and its rise, or
-    nothing."""
+    """What moves the multiplier: the violations added up, also the last one and its rise, these
+    without a unit (it needs no multiplier_rate), or nothing."""
     multiplier_init: float = 0.0
     """Multiplier to start with."""
     multiplier_rate: float = 0.4

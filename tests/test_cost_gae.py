@@ -53,7 +53,7 @@ def make_gae(value_network=None, gamma=GAMMA, lmbda=LMBDA, **kwargs):
 @pytest.mark.parametrize("vectorized", [True, False], ids=["vectorized", "loop"])
 def test_equals_the_recursion(num_costs, vectorized):
     batch = with_values(num_costs)
-    make_gae(average_gae=False, vectorized=vectorized)(batch)
+    make_gae(vectorized=vectorized)(batch)
     expected = recursion(batch)
     torch.testing.assert_close(batch["cost_advantage"], expected)
     torch.testing.assert_close(batch["cost_value_target"], expected + batch["cost_value"])
@@ -62,7 +62,7 @@ def test_equals_the_recursion(num_costs, vectorized):
 @pytest.mark.parametrize(("gamma", "lmbda"), [(0.9, 0.0), (0.0, 0.7), (1.0, 1.0)])
 def test_limits_of_the_discounts(gamma, lmbda):
     batch = with_values(2)
-    make_gae(gamma=gamma, lmbda=lmbda, average_gae=False)(batch)
+    make_gae(gamma=gamma, lmbda=lmbda)(batch)
     torch.testing.assert_close(batch["cost_advantage"], recursion(batch, gamma, lmbda))
 
 
@@ -83,7 +83,7 @@ def test_one_row_by_hand():
         ),
         batch_size=[3],
     )
-    make_gae(gamma=0.5, lmbda=0.5, average_gae=False)(batch)
+    make_gae(gamma=0.5, lmbda=0.5)(batch)
     torch.testing.assert_close(batch["cost_advantage"], column([[4.0], [1.25], [3.0]]))
 
 
@@ -98,7 +98,7 @@ def test_vectorized_by_default_and_equal_to_the_loop(num_costs):
 
 def test_truncation_bootstraps_from_the_true_next_observation(num_costs):
     critic = make_critic("cost_value", num_costs)
-    gae = make_gae(critic, average_gae=False)
+    gae = make_gae(critic)
     batch, truncated_row = make_batch(num_costs), (2, 3)
     assert batch["next", "truncated"][truncated_row]
     gae(batch)
@@ -119,35 +119,22 @@ def test_truncation_bootstraps_from_the_true_next_observation(num_costs):
     assert batch["next", "terminated"][1, 2]
 
 
-def test_centred_but_not_scaled(num_costs):
-    raw = make_gae(average_gae=False)(with_values(num_costs))["cost_advantage"].flatten(0, 1)
-    centred = make_gae()(with_values(num_costs))["cost_advantage"].flatten(0, 1)
-    # The raw means differ from zero and from each other: centring has something to do.
-    assert (raw.mean(0).abs() > 0.05).all()
-    torch.testing.assert_close(centred.mean(0), torch.zeros(num_costs), atol=1e-6, rtol=0)
-    torch.testing.assert_close(centred.std(0), raw.std(0))
-    torch.testing.assert_close(centred, raw - raw.mean(0))
+@pytest.mark.parametrize("name", ["average_gae", "group_key"])
+def test_advantages_are_scaled_elsewhere(name):
+    with pytest.raises(ValueError, match=f"{name} is not supported by CostGAE: scaled_advantages"):
+        make_gae(**{name: True})
 
 
-def test_centring_leaves_the_value_target_alone(num_costs):
-    raw = make_gae(average_gae=False)(with_values(num_costs))
-    centred = make_gae()(with_values(num_costs))
-    assert torch.equal(raw["cost_value_target"], centred["cost_value_target"])
-
-
-def test_centres_over_valid_steps_only():
-    """``shifted`` marks displaced steps invalid: they count for no mean and hold zero."""
+def test_displaced_steps_hold_nothing():
+    """``shifted`` marks displaced steps invalid; the loss leaves them out of every mean."""
     critic = make_critic("cost_value", 3)
     batch = make_gae(critic, shifted=True)(make_batch(3))
     valid = batch["shifted_valid"]
     assert not valid.all()
-    advantage = batch["cost_advantage"]
-    torch.testing.assert_close(advantage[valid].mean(0), torch.zeros(3), atol=1e-6, rtol=0)
-    assert (advantage[~valid] == 0).all()
-    exact = make_gae(critic, average_gae=False)(make_batch(3))["cost_advantage"]
-    # Row 0 never ends, so it displaces nothing: it equals the two-call path up to the centring.
-    difference = advantage[0] - exact[0]
-    torch.testing.assert_close(difference, difference[:1].expand_as(difference))
+    assert (batch["cost_advantage"][~valid] == 0).all()
+    # Row 0 never ends, so it displaces nothing: it equals the two-call path.
+    exact = make_gae(critic)(make_batch(3))["cost_advantage"]
+    torch.testing.assert_close(batch["cost_advantage"][0], exact[0])
 
 
 @pytest.mark.parametrize(
@@ -259,7 +246,7 @@ def of_one_agent(batch, agent):
 def test_agents_that_share_a_done_signal(agents, vectorized):
     """Each as if alone. With as many agents as rows and steps, done fits along a wrong axis too."""
     batch = of_agents(agents=agents)
-    got = make_gae(average_gae=False, vectorized=vectorized)(batch.clone())
+    got = make_gae(vectorized=vectorized)(batch.clone())
     for agent in range(agents):
         expected = recursion(of_one_agent(batch, agent))
         torch.testing.assert_close(got["cost_advantage"][..., agent, :], expected)
@@ -274,7 +261,7 @@ def test_agents_as_in_torchrl():
     shared["next", "cost"] = batch["next", "cost"][..., 0, :]
     for data in (batch, shared):
         expected = peer(data.clone())["advantage"]
-        torch.testing.assert_close(make_gae(average_gae=False)(data)["cost_advantage"], expected)
+        torch.testing.assert_close(make_gae()(data)["cost_advantage"], expected)
 
 
 @pytest.mark.parametrize("shared_cost", [True, False])
@@ -289,8 +276,6 @@ def test_a_signal_of_each_agent_is_that_of_all(shared_cost):
         batch["next", "cost"] = batch["next", "cost"][..., 0, :]
     one, two = make_gae()(batch), make_gae()(apart)
     torch.testing.assert_close(one["cost_advantage"], two["cost_advantage"], rtol=0, atol=0)
-    centre = one["cost_advantage"].mean((0, 1, 2))
-    torch.testing.assert_close(centre, torch.zeros(2), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(

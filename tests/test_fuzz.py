@@ -301,7 +301,12 @@ def updating(kind):
 
 UPDATERS = [
     updating(kind)
-    for kind in (objectives.DualAscent, objectives.PIDControl, objectives.ViolationUpdater)
+    for kind in (
+        objectives.DualAscent,
+        objectives.PIDControl,
+        objectives.RelativePID,
+        objectives.ViolationUpdater,
+    )
 ]
 RULE = {
     "cost_limit", "lr", "kp", "ki", "kd", "smoothing", "max_multiplier", "pessimism", "normalize",

@@ -104,7 +104,7 @@ def test_advantages_are_those_of_each_agent_alone():
     values = batch["agents", "cost_value"], batch["next", "agents", "cost_value"]
     assert values[0].shape == (ROWS, STEPS, AGENTS, COSTS)
     raw = torch.empty_like(values[0])
-    gae = CostGAE(gamma=0.99, lmbda=0.95, value_network=None, average_gae=False)
+    gae = CostGAE(gamma=0.99, lmbda=0.95, value_network=None)
     for agent in range(AGENTS):
         following = batch["next"].select("done", "terminated")
         following["cost"] = batch["next", "agents", "cost"][..., agent, :]

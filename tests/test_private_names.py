@@ -31,7 +31,7 @@ ON_POLICY = {
     "_weighted_loss_entropy",
 }
 # Hooks that TorchRL's own GAE of several agents overrides too.
-ESTIMATORS = {"_broadcast_optional", "_normalize_advantage", "_prepare_signals"}
+ESTIMATORS = {"_broadcast_optional", "_prepare_signals"}
 OFF_POLICY = {"_alpha", "_compute_target_v2", "_next_value", "_reduce_loss"}
 OFF_POLICY_FILES = {"cost_q_critics.py", "cost_td0.py", "sac_lagrangian.py", "td3_lagrangian.py"}
 

@@ -29,6 +29,7 @@ from torchrl_safe.objectives import (
     P3OLoss,
     PIDControl,
     PPOLagrangianLoss,
+    RelativePID,
     SACLagrangianLoss,
     TD3LagrangianLoss,
     TrustRegionLoss,
@@ -161,6 +162,7 @@ RULES = {
     "bounded": partial(DualAscent, lr=0.1, max_multiplier=2.0),
     "normalized": partial(DualAscent, lr=0.1, normalize=True),
     "pid": partial(PIDControl, kp=0.1, ki=0.1, kd=0.1),
+    "relative-pid": RelativePID,
 }
 
 

@@ -2,7 +2,11 @@
 
 from torchrl_safe.objectives.critics.cost_gae import CostGAE
 from torchrl_safe.objectives.critics.cost_td0 import CostTD0
-from torchrl_safe.objectives.functional import penalized_advantage, scaled_advantages
+from torchrl_safe.objectives.functional import (
+    cost_advantage_scale,
+    penalized_advantage,
+    scaled_advantages,
+)
 from torchrl_safe.objectives.off_policy.sac_lagrangian import SACLagrangianLoss
 from torchrl_safe.objectives.off_policy.td3_lagrangian import TD3LagrangianLoss
 from torchrl_safe.objectives.on_policy.crpo import CRPOLoss
@@ -14,6 +18,7 @@ from torchrl_safe.objectives.on_policy.p3o import P3OLoss
 from torchrl_safe.objectives.on_policy.ppo_lagrangian import PPOLagrangianLoss
 from torchrl_safe.objectives.rules.multipliers import DualAscent, MultiplierUpdater
 from torchrl_safe.objectives.rules.pid_control import PIDControl
+from torchrl_safe.objectives.rules.relative_pid import RelativePID
 from torchrl_safe.objectives.rules.violation import ViolationUpdater
 from torchrl_safe.objectives.trust_region.loss import TrustRegionLoss
 from torchrl_safe.objectives.trust_region.methods import (
@@ -42,6 +47,7 @@ __all__ = [
     "P3OLoss",
     "PIDControl",
     "PPOLagrangianLoss",
+    "RelativePID",
     "SACLagrangianLoss",
     "TD3LagrangianLoss",
     "TrustRegionLoss",
@@ -50,6 +56,7 @@ __all__ = [
     "TrustRegionSolution",
     "TrustRegionStep",
     "ViolationUpdater",
+    "cost_advantage_scale",
     "penalized_advantage",
     "scaled_advantages",
 ]

@@ -12,34 +12,44 @@ def scaled_advantages(
     advantage: Tensor,
     cost_advantage: Tensor,
     *,
+    cost_scale: Tensor | None = None,
     counted: Tensor | None = None,
     standardize: bool = True,
-    centre: bool = True,
     exclude_dims: Sequence[int] = (),
 ) -> tuple[Tensor, Tensor]:
     r"""Scales the advantages of a whole batch: this is where all on-policy losses do it.
 
     .. math::
         \hat A_r = \frac{A_r - \overline{A_r}}{\mathrm{std}(A_r)}, \qquad
-        \hat A_{c_i} = A_{c_i} - \overline{A_{c_i}}
+        \hat A_{c_i} = \frac{A_{c_i} - \overline{A_{c_i}}}{\sigma_i}
 
     The reward advantage is **standardized**: the objective then does not depend on the scale of
-    the rewards, and a multiplier is in units of a standard deviation of the reward advantage. The
-    advantages of the costs are only **centred**: divided by their standard deviation, a cost that
-    is rarely seen would weigh as much as one that always is, and a multiplier would mean something
-    else from batch to batch. Both are done once over the batch that was collected and before
+    the rewards. The advantages of the costs are **centred**, and divided by ``cost_scale`` if
+    there is one. Both are done once over the batch that was collected and before
     :func:`penalized_advantage` mixes them, so that a multiplier means the same in every
-    minibatch. (Ray et al. 2019 scale them so.)
+    minibatch.
+
+    - Without ``cost_scale`` a multiplier is in standard deviations of the reward advantage per
+      unit of cost, as in the code of Ray et al. 2019. A cost in another unit wants another
+      multiplier, and so does a policy whose rewards vary less than they did.
+    - With the scale of :func:`cost_advantage_scale` (``normalize_cost_advantage=True`` of the
+      losses) a multiplier has no unit: it says how many standard deviations of the reward
+      advantage one standard deviation of the cost advantage is worth.
+
+    Losses that compare a cost advantage with a violation (P3O, IPO, CRPO, CPO, PCPO) need both in
+    the unit of the cost.
 
     Args:
         advantage (Tensor): reward advantage, shape ``(*B, 1)``.
         cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
 
     Keyword Args:
+        cost_scale (Tensor, optional): what the advantages of the costs are divided by, shape
+            ``(k,)``; one of 0 divides nothing. Defaults to ``None``, the unit of the cost.
         counted (Tensor, optional): the steps that count, bool, shape ``(*B, 1)``. Defaults to
             ``None``, all of them.
-        standardize (bool, optional): whether the reward advantage is. Defaults to ``True``.
-        centre (bool, optional): whether those of the costs are. Defaults to ``True``.
+        standardize (bool, optional): whether the reward advantage is, ``False`` where something
+            else scales it. Defaults to ``True``.
         exclude_dims (sequence of int, optional): dimensions of the reward advantage that are
             standardized each on its own, such as that of the agents. Defaults to ``()``.
 
@@ -53,10 +63,63 @@ def scaled_advantages(
         (tensor([[-0.7071],
                 [ 0.7071]]), tensor([[-2.],
                 [ 2.]]))
+        >>> scale = cost_advantage_scale(torch.zeros(1), cost)
+        >>> scaled_advantages(reward, cost, cost_scale=scale)[1]
+        tensor([[-0.7071],
+                [ 0.7071]])
     """
     if standardize and advantage.numel() > 1:  # One alone has no deviation.
         advantage = standardized(advantage, counted, exclude_dims)
-    return advantage, centred(cost_advantage, counted) if centre else cost_advantage
+    cost_advantage = centred(cost_advantage, counted)
+    if cost_scale is not None:
+        cost_advantage = cost_advantage / torch.where(cost_scale > 0, cost_scale, 1.0)
+    return advantage, cost_advantage
+
+
+def cost_advantage_scale(
+    past: Tensor, cost_advantage: Tensor, counted: Tensor | None = None, *, memory: float = 0.98
+) -> Tensor:
+    r"""The scale of the cost advantages after one more batch.
+
+    .. math::
+        \sigma \leftarrow \max\big(s,\ m \sigma + (1 - m) s\big), \qquad
+        s = \mathrm{std}(A_c)
+
+    The standard deviation of the batch if it is the largest so far, and else a slow approach to
+    it from above. A policy that has learnt to keep away from a cost sees it rarely: what is left of
+    the advantage is then mostly the noise of the critic, which a division by the batch's own
+    deviation would make as large as the advantage of the reward.
+
+    Args:
+        past (Tensor): the scale until now, shape ``(k,)``; 0 at the start.
+        cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
+        counted (Tensor, optional): the steps that count, bool, shape ``(*B, 1)``. Defaults to
+            ``None``, all of them.
+
+    Keyword Args:
+        memory (float, optional): the share m of the past. Defaults to ``0.98``: half of a
+            difference is left after 34 batches.
+
+    Returns:
+        The scale, shape ``(k,)``.
+
+    Examples:
+        >>> import torch
+        >>> scale = cost_advantage_scale(torch.zeros(1), torch.tensor([[3.0], [-3.0]]))
+        >>> scale, cost_advantage_scale(scale, torch.zeros(2, 1))
+        (tensor([4.2426]), tensor([4.1578]))
+    """
+    rows = tuple(range(cost_advantage.ndim - 1))
+    largest = cost_advantage.abs() if counted is None else cost_advantage.abs() * counted
+    # Near the ends of single precision squares would be 0 or infinite.
+    unit = largest.amax(rows).clamp_min(torch.finfo(cost_advantage.dtype).tiny)
+    values = centred(cost_advantage / unit, counted)
+    count = torch.tensor(values[..., 0].numel())
+    if counted is not None:
+        values, count = values * counted, counted.sum()
+    # Unbiased, and 0 for a single step.
+    current = unit * (values.square().sum(rows) / (count - 1).clamp_min(1)).sqrt()
+    return torch.maximum(current, past.lerp(current, 1 - memory))
 
 
 def standardized(

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives.value import GAE
 
-from torchrl_safe.objectives import CostGAE
+from torchrl_safe.objectives import CostGAE, scaled_advantages
 from torchrl_safe.testing.networks import (
     ACTION_SIZE,
     OBSERVATION_SIZE,
@@ -98,8 +98,9 @@ def make_minibatch(num_costs: int = 1, *, seed: int = 1) -> TensorDictBase:
     _, critic, cost_critic = make_networks(num_costs)
     GAE(gamma=0.99, lmbda=0.95, value_network=critic)(batch)
     CostGAE(gamma=0.99, lmbda=0.95, value_network=cost_critic)(batch)
-    advantage = batch["advantage"]
-    batch["advantage"] = (advantage - advantage.mean()) / advantage.std()
+    batch["advantage"], batch["cost_advantage"] = scaled_advantages(
+        batch["advantage"], batch["cost_advantage"]
+    )
     return batch.reshape(-1)
 
 

@@ -112,9 +112,11 @@ class CostCritic(CostValues):
         They are scaled over the whole batch, as
         :func:`~torchrl_safe.objectives.scaled_advantages` says: the reward advantage is
         standardized (unless the loss has an ``advantage_norm``, which scales it instead), the cost
-        advantages are centred (by ``CostGAE``; another estimator decides for itself). Steps that
-        the loss leaves out, such as those that pad a trajectory (``("collector", "mask")``), do
-        not count. A call of the loss with a batch without advantages does the same first.
+        advantages are centred and, with ``normalize_cost_advantage``, divided by a scale that the
+        loss keeps from batch to batch.
+        Steps that the loss leaves out, such as those that pad a trajectory
+        (``("collector", "mask")``), do not count. A call of the loss with a batch without
+        advantages does the same first.
 
         Args:
             tensordict (TensorDictBase): a batch as collectors return it, shape ``(*B, T)``.
@@ -140,8 +142,7 @@ class CostCritic(CostValues):
             params=self.critic_network_params.detach() if self.functional else None,
             target_params=self.target_critic_network_params,
         )
-        estimator = self.cost_value_estimator
-        estimator(
+        self.cost_value_estimator(
             data,
             params=self.cost_critic_network_params.detach() if self.functional else None,
             target_params=self.target_cost_critic_network_params,
@@ -151,10 +152,9 @@ class CostCritic(CostValues):
         advantage, cost_advantage = scaled_advantages(
             data.get(keys.advantage),
             cost_advantage,
+            cost_scale=self._next_cost_scale(cost_advantage, mask),
             counted=mask,
             standardize=self.advantage_norm is None,
-            # CostGAE has done so already, over every step: that is over too many under a mask.
-            centre=mask is not None and isinstance(estimator, CostGAE) and estimator.average_gae,
             exclude_dims=self.normalize_advantage_exclude_dims,
         )
         data.set(keys.advantage, advantage)
@@ -162,6 +162,10 @@ class CostCritic(CostValues):
         if data is not tensordict:
             hidden = [*self._shared_keys, *(unravel_key(("next", k)) for k in self._shared_keys)]
             tensordict.update(data.exclude(*hidden))
+
+    def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
+        """What the cost advantages of this batch are divided by; None if by nothing."""
+        return None
 
     def actor_features(self, tensordict: TensorDictBase) -> TensorDictBase:
         """What the critics read of the actor, computed anew; empty if they read nothing of it."""

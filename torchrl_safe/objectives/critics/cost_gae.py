@@ -12,8 +12,6 @@ from torch import Tensor
 from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives._checks import check_share
-from torchrl_safe.objectives._reduction import expanded_mask
-from torchrl_safe.objectives.functional import centred
 
 
 class CostGAE(GAE):
@@ -29,9 +27,8 @@ class CostGAE(GAE):
       ``terminated`` may be per agent or shared by all, of shape ``(*B, T, k)`` and
       ``(*B, T, 1)``, as in :class:`~torchrl.objectives.value.MultiAgentGAE`; a shared cost wants
       a shared ``done``;
-    - ``average_gae`` **centres** each cost's advantage over the batch (all agents together)
-      without dividing by its standard deviation, so that a multiplier keeps its unit (reward per
-      cost) from batch to batch. It defaults to ``True``;
+    - the advantages are left as they are: ``estimate_advantages`` of the losses scales those of
+      reward and costs together, with :func:`~torchrl_safe.objectives.scaled_advantages`;
     - ``vectorized`` defaults to ``True``.
 
     Keyword Args:
@@ -39,14 +36,14 @@ class CostGAE(GAE):
         lmbda (float): trace decay of the costs, from 0 to 1.
         value_network (TensorDictModule, optional): cost critic with k outputs. ``None`` expects
             ``"cost_value"`` and ``("next", "cost_value")`` in the data.
-        average_gae (bool, optional): centre the advantages. Defaults to ``True``.
         vectorized (bool, optional): use the vectorized recursion, unless ``gamma`` or ``lmbda``
             is 0, for which TorchRL's fails. Defaults to ``True``.
-        **kwargs: the other arguments of :class:`~torchrl.objectives.value.GAE`, ``group_key``
-            excepted.
+        **kwargs: the other arguments of :class:`~torchrl.objectives.value.GAE`, ``average_gae``
+            and ``group_key`` excepted.
 
     Raises:
-        ValueError: if ``gamma`` or ``lmbda`` is out of its range; in a call, if the cost,
+        ValueError: if ``gamma`` or ``lmbda`` is out of its range, or the advantages are to be
+            normalized here; in a call, if the cost,
             ``done`` or ``terminated`` of a batch does not fit the shape of its value, or the
             batch has n-step sums (``"steps_to_next_obs"``), which GAE cannot be made of.
 
@@ -92,17 +89,19 @@ class CostGAE(GAE):
         gamma: float,
         lmbda: float,
         value_network: TensorDictModuleBase | None,
-        average_gae: bool = True,
         vectorized: bool | None = True,
         **kwargs: Any,
     ) -> None:
-        if kwargs.get("group_key") is not None:
-            raise ValueError("CostGAE centres over the whole batch: group_key is not supported.")
+        for name in ("average_gae", "group_key"):
+            if kwargs.pop(name, None):
+                raise ValueError(
+                    f"{name} is not supported by CostGAE: scaled_advantages scales advantages, of "
+                    "reward and costs together."
+                )
         super().__init__(
             gamma=check_share("gamma", gamma),
             lmbda=check_share("lmbda", lmbda),
             value_network=value_network,
-            average_gae=average_gae,
             vectorized=vectorized,
             **kwargs,
         )
@@ -166,8 +165,3 @@ class CostGAE(GAE):
                 f"{self.tensor_keys.value!r} has {tuple(value.shape)}, got {tuple(signal.shape)}."
             )
         return signal.expand_as(value)
-
-    def _normalize_advantage(
-        self, adv: Tensor, valid: Tensor | None = None, groups: Tensor | None = None
-    ) -> Tensor:
-        return centred(adv, None if valid is None else expanded_mask(valid, adv))

@@ -24,6 +24,7 @@ from torchrl_safe.objectives.critics.cost_values import (
     initial_multiplier,
     report_each,
 )
+from torchrl_safe.objectives.functional import cost_advantage_scale
 
 
 class ConstrainedLoss(CostCritic):
@@ -44,9 +45,26 @@ class ConstrainedLoss(CostCritic):
 
     lagrange_multiplier: Tensor
     cost_violation: Tensor
+    cost_advantage_scale: Tensor
 
-    def __init__(self, *args: Any, multiplier_init: float | Tensor = 0.0, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        multiplier_init: float | Tensor = 0.0,
+        normalize_cost_advantage: bool = False,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(*args, **kwargs)
+        if not isinstance(normalize_cost_advantage, bool):
+            raise TypeError(
+                f"normalize_cost_advantage must be a bool, got {normalize_cost_advantage!r}."
+            )
+        if normalize_cost_advantage and "lagrange_multiplier" not in self.cost_buffers:
+            raise TypeError(
+                f"{type(self).__name__} compares the cost advantage with a violation, in the unit "
+                "of the cost: normalize_cost_advantage is not supported."
+            )
+        self.normalize_cost_advantage = normalize_cost_advantage
         multiplier = initial_multiplier(self.num_costs, multiplier_init)
         if multiplier.any() and "lagrange_multiplier" not in self.cost_buffers:
             raise TypeError(
@@ -55,6 +73,15 @@ class ConstrainedLoss(CostCritic):
         for name in self.cost_buffers:
             start = multiplier if name == "lagrange_multiplier" else torch.zeros_like(multiplier)
             self.register_buffer(name, start.to(self.cost_critic_coeff.device))
+        if normalize_cost_advantage:
+            self.register_buffer("cost_advantage_scale", torch.zeros_like(self.lagrange_multiplier))
+
+    @torch.no_grad()
+    def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
+        if not self.normalize_cost_advantage:
+            return None
+        scale = cost_advantage_scale(self.cost_advantage_scale, cost_advantage, mask)
+        return self.cost_advantage_scale.copy_(scale)
 
     @abc.abstractmethod
     def policy_losses(

@@ -57,6 +57,9 @@ class FOCOPSLoss(ConstrainedPPO, PPOLoss):
             Defaults to ``0.0``.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
+        normalize_cost_advantage (bool, optional): divide the cost advantages by their standard
+            deviation, as :func:`~torchrl_safe.objectives.scaled_advantages` says, so that a
+            multiplier has no unit. Defaults to ``False``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.PPOLoss`.
 
     Raises:

@@ -48,6 +48,9 @@ class LagrangianLoss(ConstrainedLoss, WrappedLoss):
             Defaults to ``1.0``.
         separate_losses (bool, optional): leave parameters that the cost critic shares with the
             policy out of the cost critic's loss. Defaults to ``False``.
+        normalize_cost_advantage (bool, optional): divide the cost advantages by their standard
+            deviation, as :func:`~torchrl_safe.objectives.scaled_advantages` says, so that a
+            multiplier has no unit. Defaults to ``False``.
 
     Raises:
         TypeError: if ``separate_losses`` is not a bool.
@@ -88,6 +91,7 @@ class LagrangianLoss(ConstrainedLoss, WrappedLoss):
         multiplier_init: float | Tensor = 0.0,
         cost_critic_coeff: float = 1.0,
         separate_losses: bool = False,
+        normalize_cost_advantage: bool = False,
     ) -> None:
         super().__init__(
             loss_module,
@@ -96,6 +100,7 @@ class LagrangianLoss(ConstrainedLoss, WrappedLoss):
             multiplier_init=multiplier_init,
             cost_critic_coeff=cost_critic_coeff,
             separate_losses=separate_losses,
+            normalize_cost_advantage=normalize_cost_advantage,
         )
 
     def policy_losses(

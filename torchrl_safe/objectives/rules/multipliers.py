@@ -67,6 +67,8 @@ class MultiplierUpdater(CostUpdater):
     """
 
     buffer_name = "lagrange_multiplier"
+    # What of the scale of violations each batch forgets.
+    _forgotten = 0.1
 
     def __init__(
         self,
@@ -100,7 +102,7 @@ class MultiplierUpdater(CostUpdater):
             # and rare costs would exceed the limit on average.
             scale = torch.maximum(current, past)
             violation = torch.where(scale > 0, violation / scale, 0.0)
-            cost_scale = torch.maximum(current, past.lerp(current, 0.1))
+            cost_scale = torch.maximum(current, past.lerp(current, self._forgotten))
         proposal = self.next_multiplier(buffer, violation)
         # A proposal of infinity is one beyond the bound, if there is one.
         projected = proposal.clamp(0, self.max_multiplier)

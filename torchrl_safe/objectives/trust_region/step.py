@@ -293,7 +293,11 @@ class TrustRegionStep:
         loss = self.loss_module
         gamma = loss.cost_value_estimator.gamma
         check_length_known(self.episode_length, gamma)
-        return float(per_step(self.episode_length, gamma)) * loss.cost_violation.item()
+        violation = float(per_step(self.episode_length, gamma)) * loss.cost_violation.item()
+        # In the unit of the cost advantages.
+        if loss.normalize_cost_advantage and loss.cost_advantage_scale > 0:
+            violation /= loss.cost_advantage_scale.item()
+        return violation
 
     @torch.no_grad()
     def _search(

@@ -1,0 +1,185 @@
+"""RelativePID against hand numbers, in any unit, at its bounds and after a restart."""
+
+import copy
+import math
+
+import pytest
+import torch
+from on_policy import make_loss
+from torchrl.objectives import LossModule
+
+from torchrl_safe.objectives import RelativePID
+
+NAN, INF = float("nan"), float("inf")
+
+
+def make_updater(*multiplier, cost_limit=10.0, pessimism=0.0, **kwargs):
+    module = LossModule()
+    module.register_buffer("lagrange_multiplier", torch.tensor(multiplier or (0.0,)))
+    return RelativePID(module, cost_limit=cost_limit, pessimism=pessimism, **kwargs)
+
+
+def multiplier(updater):
+    return updater.loss_module.lagrange_multiplier
+
+
+def step(updater, *costs):
+    updater.step(torch.tensor(costs).reshape(len(costs), -1))
+    return multiplier(updater)
+
+
+@pytest.mark.parametrize(
+    ("costs", "limit", "violation"),
+    [
+        # Mean 11; the deviation sqrt 2 is less than a fifth of the limit.
+        pytest.param([10.0, 12.0], 10.0, 1 / 2, id="a-share-of-the-limit"),
+        # Mean 20, deviation sqrt 800.
+        pytest.param([0.0, 40.0], 10.0, 10 / math.sqrt(800), id="the-spread-of-episodes"),
+        pytest.param([9.0, 9.0], 10.0, -1 / 2, id="kept"),
+        pytest.param([200.0, 200.0], 10.0, 1.0, id="far-above"),
+        pytest.param([0.0, 0.0], 10.0, -1.0, id="far-below"),
+        pytest.param([11.0], 10.0, 1 / 2, id="one-episode"),
+        pytest.param([3.0, 3.0], 0.0, 1.0, id="limit-zero"),
+        pytest.param([0.0, 0.0], 0.0, 0.0, id="nothing-at-all"),
+    ],
+)
+def test_one_step_by_hand(costs, limit, violation):
+    updater = make_updater(math.e - 1, cost_limit=limit, kp=0.5, ki=0.1)
+    expected = math.exp(1 + (0.1 + 0.5) * violation) - 1
+    torch.testing.assert_close(step(updater, *costs), torch.tensor([expected]))
+
+
+def test_the_integral_stays_and_the_other_parts_do_not():
+    # v is 1/2, then 1, then 0: the last rise is one half, and a fall is none.
+    updater = make_updater(kp=0.5, ki=0.1, kd=0.3)
+    expected = [0.05 + 0.25, 0.15 + 0.5 + 0.3 * 0.5, 0.15]
+    for cost, exponent in zip((11.0, 12.0, 10.0), expected, strict=True):
+        torch.testing.assert_close(step(updater, cost).log1p(), torch.tensor([exponent]))
+
+
+def test_pessimism_adds_standard_errors():
+    # Mean 10 and a standard error of 1, which is half of a fifth of the limit.
+    updater = make_updater(pessimism=1.0, kp=0.5, ki=0.1)
+    torch.testing.assert_close(step(updater, 9.0, 11.0).log1p(), torch.tensor([0.6 * 0.5]))
+
+
+def test_the_spread_is_the_largest_so_far_slowly_forgotten():
+    # Deviations of sqrt 800 twice, then of nothing: the second 11 counts by 0.8 sqrt 800 + 0.4.
+    updater = make_updater(kp=0.0, ki=1.0)
+    step(updater, -10.0, 30.0)
+    spread = math.sqrt(800)
+    exponents = [step(updater, 11.0, 11.0).log1p().item() for _ in range(2)]
+    assert exponents == pytest.approx([1 / spread, 1 / spread + 1 / (0.8 * spread + 0.2 * 2)])
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3, 1e6])
+def test_costs_in_another_unit_move_the_same_multipliers(unit):
+    plain, other = (make_updater(kp=0.7, kd=0.4, pessimism=1.0, cost_limit=2.0) for _ in range(2))
+    other.cost_limit *= unit
+    generator = torch.Generator().manual_seed(0)
+    seen = []
+    for scale in (50.0, 8.0, 1.0, 3.0, 0.0, 5.0):
+        costs = scale * torch.rand(6, 1, generator=generator)
+        plain.step(costs)
+        other.step(unit * costs)
+        torch.testing.assert_close(multiplier(other), multiplier(plain))
+        seen.append(multiplier(plain).item())
+    assert max(seen) > 0.5
+
+
+@pytest.mark.parametrize("limit", [0.025, 25.0, 25_000.0])
+def test_a_limit_that_is_far_away_is_answered_within_twenty_batches(limit):
+    """From nothing to a weight of the costs of six sevenths, and back at the same pace."""
+    updater = make_updater(cost_limit=limit)
+    for _ in range(20):
+        step(updater, 50 * limit, 50 * limit)
+    assert 1 / (1 + multiplier(updater).item()) < 1 / 7
+    for _ in range(20):
+        step(updater, 0.0, 0.0)
+    assert multiplier(updater).item() == 0
+
+
+def test_it_winds_up_no_further_than_its_bounds():
+    updater = make_updater(max_multiplier=20.0, kp=0.5, ki=0.1)
+    for _ in range(1000):
+        assert step(updater, 500.0) <= 20
+    # The first batch within the limit is answered: from 21 to 21 exp(-0.6).
+    torch.testing.assert_close(step(updater, 0.0), torch.tensor([21 * math.exp(-0.6) - 1]))
+    for _ in range(1000):
+        assert step(updater, 0.0) >= 0
+    torch.testing.assert_close(step(updater, 500.0), torch.tensor([math.exp(0.6) - 1]))
+
+
+@pytest.mark.parametrize(("chance", "grows"), [(0.1, True), (0.025, False)])
+def test_rare_costs_are_judged_by_their_mean(chance, grows):
+    """One episode in ten costs 10: twice the limit of 0.5; one in forty: half of it."""
+    generator = torch.Generator().manual_seed(0)
+    updater = make_updater(5.0, cost_limit=0.5)
+    seen = []
+    for _ in range(300):
+        updater.step(10 * (torch.rand(16, 1, generator=generator) < chance).float())
+        seen.append(multiplier(updater).item())
+    assert min(seen[200:]) > 10 if grows else sum(seen[200:]) / 100 < 1
+
+
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+@pytest.mark.parametrize("cost", [0.0, 1e-38, 1e-9, 1e6, 3e20])
+def test_it_stays_finite_and_comes_back(cost, limit):
+    updater = make_updater(1.0, cost_limit=limit, pessimism=2.0)
+    spread = 0.5 + torch.rand(8, 1, generator=torch.Generator().manual_seed(0))
+    for episode_cost in (cost * spread, torch.tensor([[cost]])):
+        for _ in range(20):
+            updater.step(episode_cost)
+            assert 0 <= multiplier(updater).item() <= 100
+    if limit:
+        # The spread forgets a fifth in each batch: 3e20 in some 220.
+        for _ in range(400):
+            step(updater, 0.0, 0.0)
+        assert multiplier(updater).item() == 0
+
+
+def test_each_cost_for_itself():
+    both = make_updater(0.0, 3.0, cost_limit=torch.tensor([1.0, 50.0]))
+    alone = [make_updater(0.0, cost_limit=1.0), make_updater(3.0, cost_limit=50.0)]
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        costs = torch.tensor([2.0, 100.0]) * torch.rand(4, 2, generator=generator)
+        both.step(costs)
+        for index, updater in enumerate(alone):
+            updater.step(costs[:, index : index + 1])
+            torch.testing.assert_close(multiplier(both)[index], multiplier(updater)[0])
+
+
+def test_a_multiplier_set_by_hand_is_where_it_goes_on():
+    updater, twin = make_updater(kp=0.0), make_updater(math.e - 1, kp=0.0)
+    step(updater, 30.0)
+    updater.loss_module.lagrange_multiplier.fill_(math.e - 1)
+    torch.testing.assert_close(step(updater, 11.0), step(twin, 11.0))
+
+
+def test_a_restored_rule_continues_identically():
+    generator = torch.Generator().manual_seed(0)
+    costs = 5 * torch.rand(8, 3, 2, generator=generator)
+    loss = make_loss(num_costs=2, multiplier_init=0.5)
+    limit = torch.tensor([1.0, 4.0])
+    updater = RelativePID(loss, cost_limit=limit, kp=0.3, ki=0.2, kd=0.1, max_multiplier=3.0)
+    for cost in costs[:4]:
+        updater.step(cost)
+    saved = copy.deepcopy({"loss": loss.state_dict(), "updater": updater.state_dict()})
+    # Every argument differs: what follows can only come from the state.
+    other_loss = make_loss(num_costs=2, multiplier_init=0.1, seed=3)
+    other = RelativePID(other_loss, cost_limit=0.0, pessimism=0.0)
+    other_loss.load_state_dict(saved["loss"])
+    other.load_state_dict(saved["updater"])
+    for cost in costs[4:]:
+        updater.step(cost)
+        other.step(cost)
+        assert torch.equal(loss.lagrange_multiplier, other_loss.lagrange_multiplier)
+        assert loss.lagrange_multiplier.any()
+
+
+@pytest.mark.parametrize("name", ["kp", "ki", "kd", "pessimism", "cost_limit", "max_multiplier"])
+@pytest.mark.parametrize("value", [-1.0, NAN, INF])
+def test_bad_numbers_are_named(name, value):
+    with pytest.raises(ValueError, match=f"{name} must"):
+        make_updater(**{name: value})
