@@ -39,8 +39,8 @@ from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.envs.gym import SafeGymEnv
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.objectives import (
-    DualAscent,
     MultiplierUpdater,
+    RelativePID,
     TrustRegionStep,
     ViolationUpdater,
 )
@@ -181,7 +181,7 @@ class Critic(torch.nn.Module):
     def __init__(self, standardize: Standardize, values: int) -> None:
         super().__init__()
         self.standardize = standardize
-        self.net = small_network(len(standardize.mean), values)
+        self.net = small_network(len(standardize.mean), values, gain=0.0)
         self.register_buffer("mean", torch.zeros(values))
         self.register_buffer("std", torch.ones(values))
         self.register_buffer("changes", torch.zeros(()))
@@ -237,10 +237,10 @@ class Agent(NamedTuple):
     cost_critic: ValueOperator
 
 
-def small_network(inputs: int, outputs: int) -> MLP:
-    """Two hidden layers of 64 that give nearly the same everywhere to start with."""
+def small_network(inputs: int, outputs: int, gain: float) -> MLP:
+    """Two hidden layers of 64 that give nearly the same everywhere to start with; 0 with gain 0."""
     net = MLP(inputs, outputs, num_cells=[64, 64], activation_class=torch.nn.Tanh)
-    torch.nn.init.orthogonal_(net[-1].weight, 0.01)
+    torch.nn.init.orthogonal_(net[-1].weight, gain)
     torch.nn.init.zeros_(net[-1].bias)
     return net
 
@@ -256,7 +256,7 @@ def make_agent(env: EnvBase, log_std: float) -> Agent:
     standardize, actions = Standardize(observation.shape[0]), action.shape[0]
     policy = torch.nn.Sequential(
         standardize,
-        small_network(observation.shape[0], actions),
+        small_network(observation.shape[0], actions, gain=0.01),
         AddStateIndependentNormalScale(actions, init_value=log_std),
     )
     bounds = {}
@@ -295,7 +295,7 @@ def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | Violat
     if wanted is keep_multiplier:
         return None
     if wanted is move_multiplier:
-        return DualAscent(loss, cost_limit=limits, lr=0.4, normalize=True, pessimism=2.0)
+        return RelativePID(loss, cost_limit=limits)
     return ViolationUpdater(loss, cost_limit=limits)
 
 
@@ -307,7 +307,10 @@ class Learner:
         assert isinstance(algorithm, OnPolicy)
         self.config, self.agent = config, agent
         networks = agent.actor, agent.critic, agent.cost_critic
-        self.loss = algorithm.loss(*networks, num_costs=len(config.cost_keys))
+        options: dict[str, Any] = {"num_costs": len(config.cost_keys)}
+        if algorithm.updater is move_multiplier:  # RelativePID's multiplier has no unit.
+            options["normalize_cost_advantage"] = True
+        self.loss = algorithm.loss(*networks, **options)
         discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
         self.loss.make_value_estimator(ValueEstimators.GAE, **discount)
         self.loss.make_cost_value_estimator(**discount)

@@ -33,7 +33,7 @@ class Slide(gymnasium.Env):
         self.speed = 0.8 * self.speed + 0.1 * float(action[0])
         self.place += self.speed
         self.count += 1
-        fast, far = max(self.speed - 0.3, 0) * self.cost_size, float(self.place > 1)
+        fast, far = max(self.speed - 0.05, 0) * self.cost_size, float(self.place > 1)
         info = {"cost": fast, "costs": {"fast": fast, "far": far}}
         truncated = self.count == STEPS
         return self.observe(), self.speed * self.reward_size, False, truncated, info

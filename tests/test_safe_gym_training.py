@@ -17,7 +17,7 @@ from torchrl_safe.policy import load_policy
 # Two episodes in each of two environments.
 SMALL = Config(
     env="sliding:Slide-v0",
-    cost_limit=(0.5,),
+    cost_limit=(0.25,),
     frames=400,
     frames_per_batch=80,
     envs=2,
@@ -113,9 +113,7 @@ def test_algorithms(tmp_path, algorithm):
         for before, after in zip(fresh.actor.parameters(), agent.actor.parameters(), strict=True)
     ]
     assert all(moved)
-    assert ("multiplier/cost" in log.rows[0]) == (
-        algorithm not in ("cpo", "pcpo", "p3o", "ipo", "crpo")
-    )
+    assert ("multiplier/cost" in log.rows[0]) == (algorithm not in ("p3o", "ipo", "crpo"))
 
 
 def make_agent_of(config):
@@ -164,7 +162,7 @@ def test_the_size_of_rewards_costs_and_limit_does_not_matter(tmp_path):
         train(replace(SMALL, out=tmp_path / "one"), progress=False),
         train(
             replace(
-                SMALL, env="sliding:SlideScaled-v0", cost_limit=(512.0,), out=tmp_path / "other"
+                SMALL, env="sliding:SlideScaled-v0", cost_limit=(256.0,), out=tmp_path / "other"
             ),
             progress=False,
         ),
@@ -174,6 +172,7 @@ def test_the_size_of_rewards_costs_and_limit_does_not_matter(tmp_path):
     assert other["return"] == pytest.approx(128 * one["return"], rel=1e-3)
     assert other["cost/cost"] == pytest.approx(1024 * one["cost/cost"], rel=1e-3)
     assert one["multiplier/cost"] > 0
+    assert other["multiplier/cost"] == pytest.approx(one["multiplier/cost"], rel=1e-3)
     for (name, value), scaled in zip(
         agents[0].actor.named_parameters(), agents[1].actor.parameters(), strict=True
     ):
@@ -182,15 +181,15 @@ def test_the_size_of_rewards_costs_and_limit_does_not_matter(tmp_path):
 
 def test_units_change_and_predictions_stay():
     critic = Critic(Standardize(2), 2)
+    torch.nn.init.normal_(critic.net[-1].weight)
     observation = torch.randn(50, 2, dtype=torch.float64)
     for scale in (1.0, 1e3, 1e-3):
         before = critic(observation)
         targets = scale * (torch.randn(50, 2) + torch.tensor([3.0, 0.0]))
         critic.change_units(targets)
         torch.testing.assert_close(critic.mean, targets.mean(0))
-        # The rounding is that of the larger numbers.
-        largest = before.abs().max().item() + scale
-        torch.testing.assert_close(critic(observation), before, rtol=0, atol=1e-5 * largest)
+        # Single precision rounds the larger numbers in between.
+        torch.testing.assert_close(critic(observation), before, rtol=0, atol=2e-3)
 
 
 def test_units_of_costs_that_become_rare():
