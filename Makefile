@@ -7,6 +7,7 @@ READY := $(VENV)/.ready
 # Safety-Gymnasium pins an older Gymnasium and MuJoCo than ours.
 SAFETY := .venv-safety-gymnasium
 SAFETY_FILES := $(addprefix tests/with_safety_gymnasium/,requirements.txt make_importable.py)
+OMNISAFE_FILE := tests/with_safety_gymnasium/omnisafe.txt
 
 # What rounds differently from one processor to the next: losses, trust region, multipliers, metrics.
 NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrained_optimum cost_gae \
@@ -14,8 +15,8 @@ NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrai
 	offpolicy_optimum pid_control ppo_lagrangian sac_lagrangian trust_region trust_region_loss \
 	trust_region_optimum trust_region_step violation))
 
-.PHONY: train test test-kernels test-slow test-wheel test-safety-gymnasium compare paper sweep profile \
-	gallery bench draws ray docs lint format type clean
+.PHONY: train test test-kernels test-slow test-wheel test-safety-gymnasium safe-gym safe-gym-grid \
+	bench-omnisafe compare paper sweep profile gallery bench draws ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -34,6 +35,15 @@ test-slow: $(READY)  ## every combination, and the tests that train for minutes
 
 test-safety-gymnasium: $(SAFETY)/.ready  ## with Safety-Gymnasium itself, in an environment of its own
 	OMP_NUM_THREADS=1 $(SAFETY)/bin/pytest tests/with_safety_gymnasium $(ARGS)
+
+safe-gym: $(SAFETY)/.ready  ## train in Safety-Gymnasium: ARGS="--env SafetySwimmerVelocity-v1"
+	$(SAFETY)/bin/python -m experiments.safe_gym $(ARGS)
+
+safe-gym-grid: $(SAFETY)/.omnisafe  ## against OmniSafe; goes on where it was stopped
+	$(SAFETY)/bin/python -m experiments.safe_gym_grid $(ARGS)
+
+bench-omnisafe: $(SAFETY)/.omnisafe  ## speed against OmniSafe; wants a quiet machine
+	OMP_NUM_THREADS=1 $(SAFETY)/bin/python -m benchmarks.omnisafe $(ARGS)
 
 test-wheel:  ## the package as people get it: an empty environment, with and without the arms
 	PYTHON=$(PYTHON) .ci/test-wheel
@@ -87,7 +97,11 @@ $(READY): pyproject.toml constraints.txt
 
 $(SAFETY)/.ready: pyproject.toml constraints.txt $(SAFETY_FILES)
 	$(PYTHON) -m venv $(SAFETY)
-	$(SAFETY)/bin/pip install --quiet --constraint constraints.txt --editable . pytest
+	$(SAFETY)/bin/pip install --quiet --constraint constraints.txt --editable . pytest tqdm tyro
 	$(SAFETY)/bin/pip install --quiet --no-deps --requirement tests/with_safety_gymnasium/requirements.txt
 	$(SAFETY)/bin/python tests/with_safety_gymnasium/make_importable.py
+	touch $@
+
+$(SAFETY)/.omnisafe: $(SAFETY)/.ready $(OMNISAFE_FILE)
+	$(SAFETY)/bin/pip install --quiet --no-deps --requirement $(OMNISAFE_FILE)
 	touch $@

@@ -92,7 +92,7 @@ class Config:
     a C++ compiler."""
     frames_per_batch: int = 8_000
     """Steps between two updates of the policy: some whole episodes at least."""
-    epochs: int = 40
+    epochs: int = 20
     """Passes over each batch at most."""
     max_kl: float = 0.02
     """Divergence from the policy that collected the batch, after which its passes end; the size of

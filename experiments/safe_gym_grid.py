@@ -1,0 +1,165 @@
+"""Our PPO-Lagrangian with its defaults against OmniSafe's with its own: ``make safe-gym-grid``.
+
+Same environments, limit and steps, several seeds. Stopped and started again, it goes on with the
+runs that are missing. Needs OmniSafe, which ``make safe-gym-grid`` installs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from itertools import product
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal
+
+import torch
+import tyro
+
+from experiments import safe_gym
+from experiments.files import write_whole
+from experiments.grid import run_grid
+
+Library = Literal["ours", "omnisafe"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Compare with OmniSafe's PPOLag."""
+
+    envs: tuple[str, ...] = ("SafetySwimmerVelocity-v1", "SafetyHopperVelocity-v1")
+    """Environments of Safety-Gymnasium."""
+    libraries: tuple[Library, ...] = ("ours", "omnisafe")
+    """Whose PPO-Lagrangian to train with."""
+    seeds: int = 3
+    """Runs for each environment and library, with seeds from 0."""
+    frames: int = 500_000
+    """Steps to train for; whole epochs of OmniSafe, 20,000 steps each."""
+    cost_limit: float = 25.0
+    """Limit of the expected cost of an episode."""
+    workers: int = os.cpu_count() or 1
+    """Runs side by side."""
+    out: Path = Path("runs/safe-gym")
+    """Folder of results; runs that are already there are not run again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One run of the grid."""
+
+    library: Library
+    env: str
+    seed: int
+    frames: int
+    cost_limit: float
+    out: Path
+
+
+def run(job: Run) -> dict[str, Any]:
+    """Trains once. Returns curves of return and cost by steps, and the seconds that it took."""
+    torch.set_num_threads(1)
+    curves = train_ours(job) if job.library == "ours" else train_omnisafe(job)
+    last = [row for row in curves["history"] if row["frames"] > 0.9 * job.frames]
+    final = {name: sum(row[name] for row in last) / len(last) for name in ("return", "cost")}
+    return {"library": job.library, "env": job.env, "seed": job.seed, **curves, **final}
+
+
+def train_ours(job: Run) -> dict[str, Any]:
+    """Trains with the defaults of ``python -m experiments.safe_gym``."""
+    config = safe_gym.Config(
+        env=job.env,
+        cost_limit=(job.cost_limit,),
+        frames=job.frames,
+        seed=job.seed,
+        out=job.out,
+        resume=True,
+    )
+    _, log = safe_gym.train(config, progress=False)
+    history = [
+        {"frames": row["frames"], "return": row["return"], "cost": row["cost/cost"]}
+        for row in log.rows
+        if "return" in row
+    ]
+    return {"history": history, "seconds": log.seconds}
+
+
+def train_omnisafe(job: Run) -> dict[str, Any]:
+    """Trains with OmniSafe's defaults, on one thread as ours; it cannot be resumed."""
+    import omnisafe
+
+    agent = omnisafe.Agent(
+        "PPOLag",
+        job.env,
+        custom_cfgs={
+            "seed": job.seed,
+            "train_cfgs": {"total_steps": job.frames, "torch_threads": 1, "device": "cpu"},
+            "lagrange_cfgs": {"cost_limit": job.cost_limit},
+            "logger_cfgs": {
+                "use_wandb": False,
+                "use_tensorboard": False,
+                "log_dir": str(job.out),
+            },
+        },
+    )
+    # What its files hold is a mean over the last 100 episodes: these are the episodes themselves.
+    episodes: list[dict[str, float]] = []
+    store = agent.agent.logger.store
+
+    def remember(data: Mapping[str, Any] | None = None, /, **kwargs: Any) -> None:
+        if data and "Metrics/EpRet" in data:
+            episodes.append(
+                {
+                    "frames": sum(episode["steps"] for episode in episodes)
+                    + float(data["Metrics/EpLen"]),
+                    "return": float(data["Metrics/EpRet"]),
+                    "cost": float(data["Metrics/EpCost"]),
+                    "steps": float(data["Metrics/EpLen"]),
+                }
+            )
+        store(data, **kwargs)
+
+    agent.agent.logger.store = remember
+    start = perf_counter()
+    agent.learn()
+    return {"history": episodes, "seconds": perf_counter() - start}
+
+
+def jobs(config: Config) -> dict[Path, tuple[Run]]:
+    """What to run, by the file of its results."""
+    found = {}
+    for seed, env, library in product(range(config.seeds), config.envs, config.libraries):
+        folder = config.out / library / env / str(seed)
+        found[folder.with_suffix(".json")] = (
+            Run(library, env, seed, config.frames, config.cost_limit, folder),
+        )
+    return found
+
+
+def table(runs: list[dict[str, Any]], config: Config) -> str:
+    """Returns a Markdown table with a row for each environment and library."""
+    lines = [
+        f"| environment | PPO-Lagrangian | return | cost (limit {config.cost_limit:g}) | minutes |",
+        "|---" * 5 + "|",
+    ]
+    for env, library in product(config.envs, config.libraries):
+        mine = [run for run in runs if (run["env"], run["library"]) == (env, library)]
+        returns, costs = (", ".join(f"{run[k]:.1f}" for run in mine) for k in ("return", "cost"))
+        minutes = sum(run["seconds"] for run in mine) / len(mine) / 60
+        lines.append(f"| {env} | {library} | {returns} | {costs} | {minutes:.1f} |")
+    return "\n".join(lines)
+
+
+def main(config: Config) -> None:
+    """Runs what is missing, then writes the table and a line of JSON for each run."""
+    runs = run_grid(run, jobs(config), workers=config.workers, name="safe-gym")
+    lines = "".join(f"{json.dumps(run)}\n" for run in runs)
+    write_whole(config.out / "results.jsonl", lines)
+    text = table(runs, config)
+    write_whole(config.out / "table.md", text)
+    print(f"{text}\n\nSeeds side by side, means of the last tenth of training.")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
