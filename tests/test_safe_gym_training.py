@@ -10,7 +10,7 @@ import torch
 from torch.distributions import kl_divergence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from experiments import safe_gym
+from experiments import safe_gym, safe_gym_grid
 from experiments.safe_gym import Config, Critic, Standardize, main, make_agent, make_env, train
 from torchrl_safe.policy import load_policy
 
@@ -281,3 +281,21 @@ def test_compiled_is_the_same(tmp_path):
         agents[0].actor.named_parameters(), agents[1].actor.parameters(), strict=True
     ):
         torch.testing.assert_close(compiled, value, rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_the_grid_against_omnisafe(monkeypatch):
+    config = safe_gym_grid.Config()
+    jobs = safe_gym_grid.jobs(config)
+    assert len({job.out for (job,) in jobs.values()}) == len(jobs) == 2 * 2 * 3
+    history = [
+        {"frames": 50_000 * batch, "return": float(batch), "cost": 2.0 * batch}
+        for batch in range(1, 11)
+    ]
+    curves = {"history": history, "seconds": 90.0}
+    for name in ("train_ours", "train_omnisafe"):
+        monkeypatch.setattr(safe_gym_grid, name, lambda job: curves)
+    runs = [safe_gym_grid.run(*job) for job in jobs.values()]
+    # Of the last tenth: the tenth batch alone.
+    assert [run["return"] for run in runs] == [10.0] * 12
+    row = "| SafetySwimmerVelocity-v1 | omnisafe | 10.0, 10.0, 10.0 | 20.0, 20.0, 20.0 | 1.5 |"
+    assert row in safe_gym_grid.table(runs, config)
