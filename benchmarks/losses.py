@@ -1,7 +1,9 @@
 """Eager time of a minibatch for each on-policy loss, in this checkout and in another, in turn.
 
-``python -m benchmarks.losses --against ../other`` prints a ratio for each loss: this checkout's
-time over the other's, each the least of many turns, since other work on a machine only adds.
+``python -m benchmarks.losses --against ../other`` prints for each loss its milliseconds and the
+ratio of this checkout's time to the other's: the median over turns, taken in pairs. A process keeps
+the memory it was given, which alone can make a loss 5 % slower, so each round starts new ones, and
+the ratio is the median of the rounds, with the lowest and the highest beside it.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from time import process_time
 
 import torch
@@ -29,9 +32,11 @@ class Config:
     """Root of the other checkout."""
     sizes: tuple[int, ...] = (64, 256)
     """Steps in a minibatch."""
-    turns: int = 40
-    """How often each loss is timed, in both checkouts."""
-    calls: int = 10
+    rounds: int = 9
+    """How often new processes are started."""
+    turns: int = 60
+    """How often each loss is timed in a round, in both checkouts."""
+    calls: int = 1
     """Forward and backward passes in a turn."""
     worker: bool = False
     """Serve times to another process, one for each line that comes in."""
@@ -99,24 +104,35 @@ def ask(worker: subprocess.Popen[str], name: str, size: int) -> float:
     return float(worker.stdout.readline())
 
 
+def measure_round(config: Config) -> dict[tuple[int, str], tuple[float, float]]:
+    """Median seconds and median ratio of each size and loss, from one process for each checkout."""
+    here = Path(__file__).resolve().parents[1]
+    workers = [start_worker(root, config) for root in (here, config.against)]
+    cases = [(size, name) for size in config.sizes for name in make_losses()]
+    pairs: dict[tuple[int, str], list[list[float]]] = {case: [] for case in cases}
+    for _ in range(config.turns):
+        for size, name in cases:
+            pairs[size, name].append([ask(worker, name, size) for worker in workers])
+    for worker in workers:
+        worker.terminate()
+    return {
+        case: (median(mine for mine, _ in turns), median(mine / other for mine, other in turns))
+        for case, turns in pairs.items()
+    }
+
+
 def main(config: Config) -> None:
     """Prints milliseconds and ratios."""
     if config.worker:
         serve(config)
         return
-    here = Path(__file__).resolve().parents[1]
-    workers = [start_worker(root, config) for root in (here, config.against)]
-    names = list(make_losses())
-    for size in config.sizes:
-        least = {name: [float("inf")] * 2 for name in names}
-        for _ in range(config.turns):
-            for name in names:
-                for index, worker in enumerate(workers):
-                    least[name][index] = min(least[name][index], ask(worker, name, size))
-        for name, (mine, other) in least.items():
-            print(f"{size:4} {name:24} {1e3 * mine:6.3f} ms {mine / other:6.3f} x", flush=True)
-    for worker in workers:
-        worker.terminate()
+    rounds = [measure_round(config) for _ in range(config.rounds)]
+    for size, name in rounds[0]:
+        seconds, ratios = zip(*(measured[size, name] for measured in rounds), strict=True)
+        print(
+            f"{size:4} {name:24} {1e3 * median(seconds):6.3f} ms {median(ratios):6.3f} x"
+            f"  ({min(ratios):.3f} to {max(ratios):.3f})"
+        )
 
 
 if __name__ == "__main__":
