@@ -74,7 +74,7 @@ TWO_COSTS = {"collision": Collision(), "one": count_one}
     "parts",
     [
         pytest.param(p.values, id=p.id, marks=p.marks)
-        for p in combinations(ARMS, TASKS, OBSTACLES, ACTIONS)
+        for p in combinations(ARMS, TASKS, OBSTACLES, ACTIONS, every=4)
     ],
 )
 def test_checkers_of_gymnasium_and_stable_baselines(parts):
