@@ -48,6 +48,8 @@ from torchrl_safe.policy import save_policy
 
 # What may be another when a run is resumed: it changes nothing in what is learnt.
 CHANGEABLE = ("out", "logger", "resume", "compile", "eval_episodes")
+# What a loss does not read once there are advantages; left out, minibatches are cut faster.
+NOT_LEARNT_FROM = ("next", "done", "terminated", "truncated", "episode_reward", "episode_cost")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,20 +335,21 @@ class Learner:
     def learn(self, batch: TensorDictBase) -> float:
         """Learns from a batch as the collector returns it; returns how far the policy moved."""
         actor = self.agent.actor
-        with torch.no_grad():  # Once for the batch, not in each step.
+        with torch.no_grad():  # Once for the batch, not in each step. Writes loc and scale too.
             before = actor.get_dist(batch)
             batch["action_log_prob"] = before.log_prob(batch["action"])
         self.loss.estimate_advantages(batch)
         self.agent.critic.module.change_units(batch["value_target"])
         self.agent.cost_critic.module.change_units(batch["cost_value_target"])
-        data = batch.exclude("next").reshape(-1)
+        data = batch.exclude(*NOT_LEARNT_FROM).reshape(-1)
         if self.step is not None:
             self.step.step(data)
         for epoch in range(self.epochs):
             for minibatch in self._minibatches(data):
                 self._descend(self.objective(minibatch))
             with torch.no_grad():
-                kl = kl_divergence(before, actor.get_dist(batch)).mean().item()
+                now = actor.get_dist(batch.select("observation"))
+                kl = kl_divergence(before, now).mean().item()
             if not math.isfinite(kl):
                 raise ValueError(f"The policy is not finite after pass {epoch}.")
             if kl > self.config.max_kl and self.step is None:
