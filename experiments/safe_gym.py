@@ -345,8 +345,10 @@ class Learner:
         if self.step is not None:
             self.step.step(data)
         for epoch in range(self.epochs):
-            for minibatch in self._minibatches(data):
-                self._descend(self.objective(minibatch))
+            # What the loss was compiled for is the same in all passes: the first checks it.
+            with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
+                for minibatch in self._minibatches(data):
+                    self._descend(self.objective(minibatch))
             with torch.no_grad():
                 now = actor.get_dist(batch.select("observation"))
                 kl = kl_divergence(before, now).mean().item()
