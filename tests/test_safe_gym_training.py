@@ -271,6 +271,9 @@ def test_actions_that_are_not_continuous(tmp_path):
         train(replace(SMALL, env="sliding:Discreet-v0", out=tmp_path), progress=False)
 
 
+# PyTorch's compiler uses what PyTorch and TorchRL have deprecated.
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script_method:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
 @pytest.mark.slow
 def test_compiled_is_the_same(tmp_path):
     agents = [
