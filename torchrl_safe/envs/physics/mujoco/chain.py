@@ -50,7 +50,7 @@ class Chain:
                 before.append(frame @ turned)
                 slides.append(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
                 frame = turned.T
-        self._end, self._slides = frame, np.array(slides)
+        self._end, self._slides, self._some_slide = frame, np.array(slides), any(slides)
         # At angle q a joint brings the frame before it to A + sin(q) B + (1 - cos(q)) C; one that
         # slides, to A + q D.
         self._fixed, turns = np.array(before), ~self._slides[:, None, None]
@@ -62,20 +62,22 @@ class Chain:
     def __call__(self, angles: Array) -> ToolPose:
         """Returns where the tool is at joint angles, rad, ``(k, n)``."""
         angle = angles[:, :, None, None]
-        steps = self._fixed + np.sin(angle) * self._sine + (1 - np.cos(angle)) * self._cosine
-        if self._slides.any():
-            steps += angle * self._slide
-        frames = np.empty_like(steps)
-        frames[:, 0] = steps[:, 0]
-        for joint in range(1, steps.shape[1]):
-            np.matmul(frames[:, joint - 1], steps[:, joint], out=frames[:, joint])
+        frames = np.sin(angle) * self._sine
+        frames += self._fixed
+        frames += (1 - np.cos(angle)) * self._cosine
+        if self._some_slide:
+            frames += angle * self._slide
+        # Each frame in its neighbour's; here they become frames in the world, one after the other.
+        for joint in range(1, frames.shape[1]):
+            frames[:, joint] = frames[:, joint - 1] @ frames[:, joint]
         tool = frames[:, -1] @ self._end
         # Along the first axis x, y, z: of the joints' axes, and of the ways from them to the tool.
-        x, y, z = frames[:, :, :3, 2].transpose(2, 0, 1)
-        to_x, to_y, to_z = tool[:, :3, 3].T[:, :, None] - frames[:, :, :3, 3].transpose(2, 0, 1)
+        parts = np.ascontiguousarray(frames[:, :, :3, 2:].transpose(3, 2, 0, 1))
+        (x, y, z), origin = parts
+        to_x, to_y, to_z = tool[:, :3, 3].T[:, :, None] - origin
         rows = [y * to_z - z * to_y, z * to_x - x * to_z, x * to_y - y * to_x, x, y, z]
         jacobian = np.stack(rows, axis=1)
-        if self._slides.any():
+        if self._some_slide:
             jacobian[:, :3, self._slides] = jacobian[:, 3:, self._slides]
             jacobian[:, 3:, self._slides] = 0
         return ToolPose(tool[:, :3, 3].copy(), quaternions(tool[:, :3, :3]), jacobian)
@@ -86,21 +88,17 @@ def quaternions(matrix: Array) -> Array:
 
     Of the two of each, that with w or else the largest part positive, as PyBullet has it.
     """
-    xx, yy, zz = matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2]
-    squares = np.stack([xx - yy - zz, yy - xx - zz, zz - xx - yy, xx + yy + zz], axis=1)
-    largest = np.where(squares[:, 3] > 0, 3, squares[:, :3].argmax(axis=1))
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.ascontiguousarray(matrix.transpose(1, 2, 0))
+    squares = np.array([xx - yy - zz, yy - xx - zz, zz - xx - yy, xx + yy + zz])
+    largest = np.where(squares[3] > 0, 3, squares[:3].argmax(axis=0))
     # A symmetric matrix of all products of two parts, times 4.
-    products = np.empty((len(matrix), 4, 4))
-    products[:, range(4), range(4)] = squares + 1
-    for one, other, row, column in ((0, 1, 0, 1), (0, 2, 0, 2), (1, 2, 1, 2)):
-        products[:, one, other] = products[:, other, one] = (
-            matrix[:, row, column] + matrix[:, column, row]
-        )
-    for part, (row, column) in enumerate(((2, 1), (0, 2), (1, 0))):
-        products[:, part, 3] = products[:, 3, part] = (
-            matrix[:, row, column] - matrix[:, column, row]
-        )
-    chosen = products[np.arange(len(matrix)), largest]
+    x2, y2, z2, w2 = squares + 1
+    x_y, x_z, y_z = xy + yx, xz + zx, yz + zy
+    x_w, y_w, z_w = zy - yz, xz - zx, yx - xy
+    products = np.array(
+        [x2, x_y, x_z, x_w, x_y, y2, y_z, y_w, x_z, y_z, z2, z_w, x_w, y_w, z_w, w2]
+    ).reshape(4, 4, -1)
+    chosen = products[largest, :, np.arange(len(matrix))]
     return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
 

@@ -83,6 +83,7 @@ class MuJoCoSimulator:
 
         self._sizes = np.array([shape.half_extents for shape in shapes]).reshape(-1, 3)
         self._is_free = np.array([shape.mass > 0 for shape in shapes], dtype=bool)
+        self._some_free = bool(self._is_free.any())
         self._tracks = Tracks(num_envs, len(shapes), frame_skip)
         self._objects = FreeBodies(model, [thing(index) for index in range(len(objects))])
         self._free = FreeBodies(
@@ -94,6 +95,10 @@ class MuJoCoSimulator:
         self._contact_force = np.zeros((num_envs, len(shapes)))
         # What depends on where everything is after a substep needs one more look after the last.
         self._looks = bool(sensing.clearance or sensing.tool or sensing.links)
+        # Writing down takes time as well.
+        self._recorded = ("sensordata",)
+        if sensing.joints or (sensing.clearance and self._some_free):
+            self._recorded += ("qpos", "qvel")
         self._record: dict[str, Array] | None = None
         self._painter: Painter | None = None
         self._trace: dict[str, Array] = {}
@@ -136,7 +141,8 @@ class MuJoCoSimulator:
     def advance(self, joints: Array, fingers: Array) -> None:
         """Takes a control step towards joint targets ``(N, n)`` and finger targets ``(N, f)``."""
         tracks = self._tracks
-        self._hold_absent()
+        if self._some_free:
+            self._hold_absent()
         current = self._qpos.take(self._driven, axis=1)
         targets = current.copy()
         targets[:, : joints.shape[1]] = joints
@@ -162,7 +168,7 @@ class MuJoCoSimulator:
                 self._frame_skip,
                 controls,
                 control_spec=int(spec),
-                record=("sensordata", "qpos", "qvel"),
+                record=self._recorded,
                 out=self._record,
             )
         self._check()
@@ -194,9 +200,11 @@ class MuJoCoSimulator:
     _fingers_rest = False
 
     def _check(self) -> None:
-        finite = np.isfinite(self._qpos).all(axis=1) & np.isfinite(self._qvel).all(axis=1)
-        warned = self._batch.warning[:, :, 1]
-        if warned.any() or not finite.all():
+        # One number that is not finite makes the sum so.
+        warning = self._batch.warning
+        if warning.any() or not np.isfinite(self._qpos.sum() + self._qvel.sum()):
+            finite = np.isfinite(self._qpos).all(axis=1) & np.isfinite(self._qvel).all(axis=1)
+            warned = warning[:, :, 1]
             rows = np.flatnonzero(warned.any(axis=1) | ~finite)
             kinds = [
                 kind.name.removeprefix("mjWARN_")
@@ -223,7 +231,7 @@ class MuJoCoSimulator:
             after = record
         if self._sensing.clearance:
             ways = self._ways_after(ways)
-        self._trace = self._measure(after, self._record["qpos"], ways, before=record)
+        self._trace = self._measure(after, self._record.get("qpos"), ways, before=record)
 
     def _ways_after(self, ways: Ways | None) -> Ways:
         """Where the obstacles were after each substep."""
@@ -232,7 +240,7 @@ class MuJoCoSimulator:
             return Ways(*(part[:, 1:] for part in ways))
         shape = (len(self._goal), self._frame_skip)
         now = [np.broadcast_to(p[:, None], (*shape, *p.shape[1:])) for p in self._tracks.now]
-        if self._is_free.any():
+        if self._some_free:
             present = self._tracks.present[:, None, self._is_free, None]
             moved = self._free.read(self._record["qpos"], self._record["qvel"])
             now = [part.copy() for part in now]
@@ -241,13 +249,13 @@ class MuJoCoSimulator:
         return Ways(*now)
 
     def _measure(
-        self, after: Array, qpos: Array, ways: Ways | None, before: Array | None = None
+        self, after: Array, qpos: Array | None, ways: Ways | None, before: Array | None = None
     ) -> dict[str, Array]:
         """Names what the sensors have read in every substep.
 
         Args:
             after: what they read after each, ``(k, s, width)``.
-            qpos: positions after each.
+            qpos: positions after each; not needed where no joints are measured.
             ways: obstacles after each.
             before: what they read before each.
         """
@@ -262,6 +270,7 @@ class MuJoCoSimulator:
             if name in places:
                 trace[name] = touch_distance(places[name].of(contacts))
         if sensing.joints:
+            assert qpos is not None
             trace["joint_position"] = qpos.take(self._driven[: len(self.joint_lower)], axis=-1)
         if sensing.tool:
             trace |= {
@@ -274,7 +283,7 @@ class MuJoCoSimulator:
     def _obstacles(self) -> Ways:
         """Where the obstacles are now, each ``(N, m, width)``."""
         now = Ways(*(part.copy() for part in self._tracks.now))
-        if self._is_free.any():
+        if self._some_free:
             present = self._tracks.present[:, self._is_free, None]
             for part, values in zip(now, self._free.read(self._qpos, self._qvel), strict=True):
                 part[:, self._is_free] = np.where(present, values, part[:, self._is_free])
