@@ -50,7 +50,7 @@ class Chain:
                 before.append(frame @ turned)
                 slides.append(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
                 frame = turned.T
-        self._end, self._slides, self._some_slide = frame, np.array(slides), any(slides)
+        self._end, self._slides = frame, np.array(slides)
         # At angle q a joint brings the frame before it to A + sin(q) B + (1 - cos(q)) C; one that
         # slides, to A + q D.
         self._fixed, turns = np.array(before), ~self._slides[:, None, None]
@@ -62,22 +62,20 @@ class Chain:
     def __call__(self, angles: Array) -> ToolPose:
         """Returns where the tool is at joint angles, rad, ``(k, n)``."""
         angle = angles[:, :, None, None]
-        frames = np.sin(angle) * self._sine
-        frames += self._fixed
-        frames += (1 - np.cos(angle)) * self._cosine
-        if self._some_slide:
-            frames += angle * self._slide
-        # Each frame in its neighbour's; here they become frames in the world, one after the other.
-        for joint in range(1, frames.shape[1]):
-            frames[:, joint] = frames[:, joint - 1] @ frames[:, joint]
+        steps = self._fixed + np.sin(angle) * self._sine + (1 - np.cos(angle)) * self._cosine
+        if self._slides.any():
+            steps += angle * self._slide
+        frames = np.empty_like(steps)
+        frames[:, 0] = steps[:, 0]
+        for joint in range(1, steps.shape[1]):
+            np.matmul(frames[:, joint - 1], steps[:, joint], out=frames[:, joint])
         tool = frames[:, -1] @ self._end
         # Along the first axis x, y, z: of the joints' axes, and of the ways from them to the tool.
-        parts = np.ascontiguousarray(frames[:, :, :3, 2:].transpose(3, 2, 0, 1))
-        (x, y, z), origin = parts
-        to_x, to_y, to_z = tool[:, :3, 3].T[:, :, None] - origin
+        x, y, z = frames[:, :, :3, 2].transpose(2, 0, 1)
+        to_x, to_y, to_z = tool[:, :3, 3].T[:, :, None] - frames[:, :, :3, 3].transpose(2, 0, 1)
         rows = [y * to_z - z * to_y, z * to_x - x * to_z, x * to_y - y * to_x, x, y, z]
         jacobian = np.stack(rows, axis=1)
-        if self._some_slide:
+        if self._slides.any():
             jacobian[:, :3, self._slides] = jacobian[:, 3:, self._slides]
             jacobian[:, 3:, self._slides] = 0
         return ToolPose(tool[:, :3, 3].copy(), quaternions(tool[:, :3, :3]), jacobian)

@@ -14,7 +14,7 @@ from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.bodies import obstacle, thing
 from torchrl_safe.envs.physics.mujoco.chain import Chain, ToolPose
 from torchrl_safe.envs.physics.mujoco.clearance import Clearance
-from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
+from torchrl_safe.envs.physics.mujoco.engine import QUIET, batch, mujoco
 from torchrl_safe.envs.physics.mujoco.free import TO_MUJOCO, FreeBodies
 from torchrl_safe.envs.physics.mujoco.model import build_scenery, build_world
 from torchrl_safe.envs.physics.mujoco.motors import FINGER_GROUP, fill_controls
@@ -93,6 +93,7 @@ class MuJoCoSimulator:
         self._steps = np.zeros(num_envs, dtype=int)
         self._contact_distance = np.full((num_envs, len(shapes)), np.inf)
         self._contact_force = np.zeros((num_envs, len(shapes)))
+        self._senses = sensing != Sensing()
         # What depends on where everything is after a substep needs one more look after the last.
         self._looks = bool(sensing.clearance or sensing.tool or sensing.links)
         # Writing down takes time as well.
@@ -118,13 +119,13 @@ class MuJoCoSimulator:
         self._goal[row], self._steps[row] = goal, 0
         self._contact_distance[row], self._contact_force[row] = np.inf, 0
         self._pose = None
-        if self._sensing != Sensing():
+        if self._senses:
             self._measure_now(row)
 
     def _measure_now(self, row: int) -> None:
         """Fills the trace of a world with what is measured at the beginning of an episode."""
         if self._looks:
-            with quiet():
+            with QUIET:
                 self._batch.forward([row], stage=mujoco.mjtStage.mjSTAGE_VEL)
         rows = slice(row, row + 1)
         ways = Ways(*(part[rows, None] for part in self._obstacles()))
@@ -163,7 +164,7 @@ class MuJoCoSimulator:
                 axis=2,
             )
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
-        with quiet():
+        with QUIET:
             self._record = self._batch.rollout(
                 self._frame_skip,
                 controls,
@@ -220,11 +221,11 @@ class MuJoCoSimulator:
         assert self._record is not None
         record, contacts = self._record["sensordata"], self._places["contacts"]
         self._contact_distance, self._contact_force = touches(contacts.of(record))
-        if self._sensing == Sensing():
+        if not self._senses:
             return
         if self._looks:
             # What MuJoCo records of a substep is how everything was before it.
-            with quiet():
+            with QUIET:
                 self._batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
             after = np.concatenate([record[:, 1:], self._readings[:, None]], axis=1)
         else:
