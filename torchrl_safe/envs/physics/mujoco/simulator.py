@@ -97,7 +97,7 @@ class MuJoCoSimulator:
         # What depends on where everything is after a substep needs one more look after the last.
         self._looks = bool(sensing.clearance or sensing.tool or sensing.links)
         # Writing down takes time as well.
-        self._recorded = ("sensordata",)
+        self._recorded: tuple[str, ...] = ("sensordata",)
         if sensing.joints or (sensing.clearance and self._some_free):
             self._recorded += ("qpos", "qvel")
         self._record: dict[str, Array] | None = None
