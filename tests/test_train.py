@@ -96,8 +96,8 @@ def test_checkpoint_holds_the_loss(finished):
     last = results["algorithms"]["ppo-lagrangian"]["history"][-1]
     assert loss.lagrange_multiplier.item() == pytest.approx(last["multiplier/collision"])
     assert not torch.equal(
-        before["actor_network_params.module.0.module.0.1.0.weight"],
-        loss.state_dict()["actor_network_params.module.0.module.0.1.0.weight"],
+        before["actor_network.module.0.module.0.1.0.weight"],
+        loss.state_dict()["actor_network.module.0.module.0.1.0.weight"],
     )
 
 
