@@ -15,6 +15,7 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, LossModule, ValueEstimators
 
 from experiments.agent import make_agent, make_q_agent, num_costs
+from experiments.compiling import compiled
 from experiments.config import Config
 from experiments.learners import Learner, NoiseSchedule, OnPolicyLearner, ReplayLearner
 from torchrl_safe.envs import EarlyTermination, Saute
@@ -41,6 +42,8 @@ from torchrl_safe.objectives import (
 )
 
 Updater = MultiplierUpdater | ViolationUpdater
+# Collected control steps for each gradient step, off policy.
+_STEPS_PER_UPDATE = 8
 # Called as rule(loss, rate, cost_limit=, pessimism=, normalize=). The gains stand to each other
 # as in tests/test_constrained_optimum.py.
 MULTIPLIER_RULES: dict[str, Callable[..., MultiplierUpdater]] = {
@@ -145,16 +148,19 @@ class OnPolicy:
         _start_multiplier(loss, self.updater, config)
         batches = math.ceil(config.frames / config.frames_per_batch)
         step = None if self.method is None else TrustRegionStep(loss, self.method, max_kl=0.02)
-        phases = []
+        epochs = self.epochs or config.epochs
+        steps = batches * epochs * math.ceil(config.frames_per_batch / config.minibatch)
+        # Where a trust-region step moves the actor, the optimizer has the critics only.
+        phases = [(None, compiled(loss if step is None else loss.critic_losses, steps))]
         if self.projects:
-            phases = [(None, loss), (loss.start_projection, loss.projection_loss)]
+            phases.append((loss.start_projection, compiled(loss.projection_loss, steps)))
         learner = OnPolicyLearner(
             loss,
             agent.actor,
             NoiseSchedule(agent.log_std, last=config.last_log_std, batches=batches),
             learning_rate=config.learning_rate,
             batches=batches,
-            epochs=self.epochs or config.epochs,
+            epochs=epochs,
             minibatch=config.minibatch,
             phases=phases,
             actor_step=step,
@@ -199,11 +205,12 @@ class OffPolicy:
             collector = TensorDictSequential(agent.actor, noise)
         learner = ReplayLearner(
             loss,
+            compiled(loss, config.frames // _STEPS_PER_UPDATE),
             agent.actor,
             learning_rate=2 * config.learning_rate,
             capacity=config.frames,
             minibatch=config.minibatch,
-            steps_per_update=8,
+            steps_per_update=_STEPS_PER_UPDATE,
         )
         updater = self.updater(loss, config)
         observation_spec = env.observation_spec_unbatched

@@ -73,7 +73,6 @@ class OnPolicyLearner:
         epochs: passes over each batch, in each phase.
         minibatch: control steps in a minibatch.
         phases: what is minimized, one after the other, each with what is to be done before.
-            Defaults to ``loss``, or to its critics where ``actor_step`` moves the actor.
         actor_step: moves the actor instead of the optimizer.
     """
 
@@ -87,12 +86,12 @@ class OnPolicyLearner:
         batches: int,
         epochs: int,
         minibatch: int,
-        phases: Sequence[tuple[Callable[[], None] | None, Loss]] = (),
+        phases: Sequence[tuple[Callable[[], None] | None, Loss]],
         actor_step: TrustRegionStep | None = None,
     ) -> None:
         self.loss, self.noise, self.actor_step = loss, noise, actor_step
         self.epochs, self.minibatch = epochs, minibatch
-        self.phases = phases or [(None, loss if actor_step is None else loss.critic_losses)]
+        self.phases = phases
         self.policy = list(actor.parameters())
         moved_here = {id(parameter) for parameter in self.policy}
         critics = [p for p in loss.parameters() if id(p) not in moved_here]
@@ -137,6 +136,7 @@ class ReplayLearner:
 
     Args:
         loss: an off-policy loss with target networks.
+        objective: what is minimized: the loss itself, perhaps compiled.
         actor: the policy in it.
         learning_rate: Adam's, of all networks.
         capacity: control steps to keep.
@@ -147,6 +147,7 @@ class ReplayLearner:
     def __init__(
         self,
         loss: LossModule,
+        objective: Loss,
         actor: TensorDictModuleBase,
         *,
         learning_rate: float,
@@ -154,7 +155,7 @@ class ReplayLearner:
         minibatch: int,
         steps_per_update: int,
     ) -> None:
-        self.loss, self.steps_per_update = loss, steps_per_update
+        self.loss, self.objective, self.steps_per_update = loss, objective, steps_per_update
         self.targets = SoftUpdate(loss, tau=0.005)
         self.policy = list(actor.parameters())
         self.optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate, fused=True)
@@ -165,7 +166,7 @@ class ReplayLearner:
     def learn(self, batch: TensorDictBase) -> None:
         self.buffer.extend(batch.reshape(-1))
         for _ in range(batch.numel() // self.steps_per_update):
-            _descend(self.loss, self.buffer.sample(), self.optimizer, self.policy)
+            _descend(self.objective, self.buffer.sample(), self.optimizer, self.policy)
             self.targets.step()
 
     def state(self) -> dict[str, Any]:
