@@ -1,4 +1,4 @@
-"""Eager time of a minibatch for each on-policy loss, in this checkout and in another, in turn.
+"""Eager time of a minibatch for each loss, in this checkout and in another, in turn.
 
 ``python -m benchmarks.losses --against ../other`` prints for each loss its milliseconds and the
 ratio of this checkout's time to the other's: the median over turns, taken in pairs. A process keeps
@@ -14,14 +14,22 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from time import process_time
 
 import torch
 import tyro
-from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule
+from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, SACLoss, TD3Loss
 
 import torchrl_safe.objectives as ours
-from benchmarks.networks import make_actor, make_critic, make_minibatch
+from benchmarks.networks import (
+    make_actor,
+    make_critic,
+    make_deterministic_actor,
+    make_minibatch,
+    make_q_critic,
+    make_transitions,
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +51,7 @@ class Config:
 
 
 def make_losses() -> dict[str, LossModule]:
-    """Every on-policy loss, with one cost."""
+    """Every loss, with one cost."""
     losses = {}
     for name in ("PPOLagrangian", "FOCOPS", "CUP", "P3O", "IPO", "TrustRegion"):
         networks = make_actor(), make_critic("state_value"), make_critic("cost_value")
@@ -56,6 +64,11 @@ def make_losses() -> dict[str, LossModule]:
         wrapped = parent(make_actor(), make_critic("state_value"))
         title = f"{name}({parent.__name__})"
         losses[title] = getattr(ours, f"{name}Loss")(wrapped, make_critic("cost_value"))
+    critics = make_q_critic("state_action_value"), make_q_critic("state_action_cost_value")
+    losses["SACLagrangian"] = ours.SACLagrangianLoss(make_actor(), *critics, target_entropy=-7.0)
+    losses["TD3Lagrangian"] = ours.TD3LagrangianLoss(
+        make_deterministic_actor(), *critics, bounds=(-1.0, 1.0)
+    )
     return losses
 
 
@@ -63,14 +76,17 @@ def serve(config: Config) -> None:
     """Reads ``name size`` and answers with seconds, until the input ends."""
     torch.set_num_threads(1)
     losses = make_losses()
-    batches = {}
+    batches, transitions = {}, {}
     for size in config.sizes:
         batches[size] = make_minibatch(size)
         dist = torch.randn(size, 7), torch.ones(size, 7)
         batches[size]["loc"], batches[size]["scale"] = dist
+        transitions[size] = make_transitions(size)
     for line in sys.stdin:
         name, steps = line.split()
-        loss, batch = losses[name], batches[int(steps)]
+        loss = losses[name]
+        off_policy = isinstance(loss, SACLoss | TD3Loss)
+        batch = (transitions if off_policy else batches)[int(steps)]
         start = process_time()
         for _ in range(config.calls):
             outputs = loss(batch)
@@ -78,17 +94,16 @@ def serve(config: Config) -> None:
         print((process_time() - start) / config.calls, flush=True)
 
 
-def start_worker(root: Path, config: Config) -> subprocess.Popen[str]:
-    """A process that has the losses of a checkout."""
-    command = [sys.executable, __file__, "--worker", "--calls", str(config.calls)]
-    command += ["--sizes", *map(str, config.sizes)]
-    here = Path(__file__).resolve().parents[1]
-    # This file's benchmarks package for both, the library of each.
-    path = os.pathsep.join([str(root.resolve()), str(here)])
+def start_worker(root: Path, folder: Path, config: Config) -> subprocess.Popen[str]:
+    """A process with the losses of a checkout, and with this file's benchmarks."""
+    folder.mkdir()
+    (folder / "torchrl_safe").symlink_to(root.resolve() / "torchrl_safe")
+    (folder / "benchmarks").symlink_to(Path(__file__).resolve().parent)
+    command = [sys.executable, "-m", "benchmarks.losses", "--worker", "--calls", str(config.calls)]
     return subprocess.Popen(
-        command,
-        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
-        cwd=root,
+        [*command, "--sizes", *map(str, config.sizes)],
+        env={**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"},
+        cwd=folder,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -107,14 +122,18 @@ def ask(worker: subprocess.Popen[str], name: str, size: int) -> float:
 def measure_round(config: Config) -> dict[tuple[int, str], tuple[float, float]]:
     """Median seconds and median ratio of each size and loss, from one process for each checkout."""
     here = Path(__file__).resolve().parents[1]
-    workers = [start_worker(root, config) for root in (here, config.against)]
     cases = [(size, name) for size in config.sizes for name in make_losses()]
     pairs: dict[tuple[int, str], list[list[float]]] = {case: [] for case in cases}
-    for _ in range(config.turns):
-        for size, name in cases:
-            pairs[size, name].append([ask(worker, name, size) for worker in workers])
-    for worker in workers:
-        worker.terminate()
+    with TemporaryDirectory() as folder:
+        workers = [
+            start_worker(root, Path(folder) / name, config)
+            for name, root in (("mine", here), ("other", config.against))
+        ]
+        for _ in range(config.turns):
+            for size, name in cases:
+                pairs[size, name].append([ask(worker, name, size) for worker in workers])
+        for worker in workers:
+            worker.terminate()
     return {
         case: (median(mine for mine, _ in turns), median(mine / other for mine, other in turns))
         for case, turns in pairs.items()
