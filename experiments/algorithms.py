@@ -42,8 +42,6 @@ from torchrl_safe.objectives import (
 )
 
 Updater = MultiplierUpdater | ViolationUpdater
-# Collected control steps for each gradient step, off policy.
-_STEPS_PER_UPDATE = 8
 # Called as rule(loss, rate, cost_limit=, pessimism=, normalize=). The gains stand to each other
 # as in tests/test_constrained_optimum.py.
 MULTIPLIER_RULES: dict[str, Callable[..., MultiplierUpdater]] = {
@@ -205,12 +203,11 @@ class OffPolicy:
             collector = TensorDictSequential(agent.actor, noise)
         learner = ReplayLearner(
             loss,
-            compiled(loss, config.frames // _STEPS_PER_UPDATE),
             agent.actor,
             learning_rate=2 * config.learning_rate,
             capacity=config.frames,
             minibatch=config.minibatch,
-            steps_per_update=_STEPS_PER_UPDATE,
+            steps_per_update=8,
         )
         updater = self.updater(loss, config)
         observation_spec = env.observation_spec_unbatched

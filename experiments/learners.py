@@ -136,7 +136,6 @@ class ReplayLearner:
 
     Args:
         loss: an off-policy loss with target networks.
-        objective: what is minimized: the loss itself, perhaps compiled.
         actor: the policy in it.
         learning_rate: Adam's, of all networks.
         capacity: control steps to keep.
@@ -147,7 +146,6 @@ class ReplayLearner:
     def __init__(
         self,
         loss: LossModule,
-        objective: Loss,
         actor: TensorDictModuleBase,
         *,
         learning_rate: float,
@@ -155,7 +153,7 @@ class ReplayLearner:
         minibatch: int,
         steps_per_update: int,
     ) -> None:
-        self.loss, self.objective, self.steps_per_update = loss, objective, steps_per_update
+        self.loss, self.steps_per_update = loss, steps_per_update
         self.targets = SoftUpdate(loss, tau=0.005)
         self.policy = list(actor.parameters())
         self.optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate, fused=True)
@@ -166,7 +164,7 @@ class ReplayLearner:
     def learn(self, batch: TensorDictBase) -> None:
         self.buffer.extend(batch.reshape(-1))
         for _ in range(batch.numel() // self.steps_per_update):
-            _descend(self.objective, self.buffer.sample(), self.optimizer, self.policy)
+            _descend(self.loss, self.buffer.sample(), self.optimizer, self.policy)
             self.targets.step()
 
     def state(self) -> dict[str, Any]:
