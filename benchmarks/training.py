@@ -103,7 +103,7 @@ def run(*, quick: bool) -> list[Figure]:
         for name, other in product(mine, (many, "SB3, 1 environment")):
             title, bar = f"{case}: {name} / {other}", bars.get((name, other))
             figures.append(ratio(title, times[other], times[name], at_least=bar))
-        for name, seconds in times.items():
-            frames = config.frames_per_batch / seconds
+        for name, taken in times.items():
+            frames = config.frames_per_batch / taken
             figures.append(quartiles(f"{case}: {name}", frames, "frames/s"))
     return figures

@@ -124,6 +124,8 @@ class OnPolicy:
         epochs: passes over a batch, if not those of the configuration.
         method: the step that a trust-region method takes with the actor.
         projects: whether each batch has a second phase, CUP's projection.
+        compiles: whether the loss is compiled in long runs. (Those that ask PyTorch for the
+            divergence of two distributions cannot be, in one graph.)
         transforms: called as ``transforms(config)``, what is appended to the environment.
         training_transforms: the same, but not when the policy is evaluated.
     """
@@ -133,6 +135,7 @@ class OnPolicy:
     epochs: int | None = None
     method: TrustRegionMethod | None = None
     projects: bool = False
+    compiles: bool = False
     transforms: Callable[[Config], list[Transform]] = no_transforms
     training_transforms: Callable[[Config], list[Transform]] = no_transforms
 
@@ -149,9 +152,10 @@ class OnPolicy:
         epochs = self.epochs or config.epochs
         steps = batches * epochs * math.ceil(config.frames_per_batch / config.minibatch)
         # Where a trust-region step moves the actor, the optimizer has the critics only.
-        phases = [(None, compiled(loss if step is None else loss.critic_losses, steps))]
+        objective = loss if step is None else loss.critic_losses
+        phases = [(None, compiled(objective, steps) if self.compiles else objective)]
         if self.projects:
-            phases.append((loss.start_projection, compiled(loss.projection_loss, steps)))
+            phases.append((loss.start_projection, loss.projection_loss))
         learner = OnPolicyLearner(
             loss,
             agent.actor,
@@ -251,8 +255,8 @@ def _terminating(config: Config) -> list[Transform]:
 
 
 ALGORITHMS: dict[str, Algorithm] = {
-    "ppo": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier),
-    "ppo-lagrangian": OnPolicy(_of_ppo(PPOLagrangianLoss)),
+    "ppo": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, compiles=True),
+    "ppo-lagrangian": OnPolicy(_of_ppo(PPOLagrangianLoss), compiles=True),
     "kl-ppo-lagrangian": OnPolicy(_wrapping(LagrangianLoss, KLPENPPOLoss)),
     "a2c-lagrangian": OnPolicy(_wrapping(LagrangianLoss, A2CLoss), epochs=1),
     "trpo": OnPolicy(_of_ppo(TrustRegionLoss), keep_multiplier, method=TRPO()),

@@ -1,4 +1,4 @@
-"""A loss of fresh data that is called often enough is compiled."""
+"""A loss that is called often enough is compiled."""
 
 from __future__ import annotations
 
