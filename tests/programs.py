@@ -49,12 +49,12 @@ def run_program(path, *arguments, folder=None, strict=None, timeout=240):
     return Done(process.exitcode, *texts)
 
 
-def run_code(code, folder=None, **settings):
+def run_code(code, *arguments, **settings):
     """Runs a program as ``python -c code`` does."""
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(temporary, "program.py")
         path.write_text(code, encoding="utf-8")
-        return run_program(path, folder=folder, **settings)
+        return run_program(path, *arguments, **settings)
 
 
 def _run(path, arguments, folder, strict, outputs):

@@ -2,8 +2,6 @@
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import get_args
 
@@ -11,6 +9,7 @@ import pytest
 import torch
 import tyro
 from PIL import Image
+from programs import run_code
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
@@ -26,14 +25,8 @@ ROOT = Path(__file__).parent.parent
 
 
 def run(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.train", *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
+    code = "import runpy; runpy.run_module('experiments.train', run_name='__main__')"
+    return run_code(code, *arguments, folder=ROOT)
 
 
 KINDS = {"cpo", "cup", "ppo-saute", "td3-lagrangian"}
