@@ -104,6 +104,6 @@ def run(*, quick: bool) -> list[Figure]:
             title, bar = f"{case}: {name} / {other}", bars.get((name, other))
             figures.append(ratio(title, times[other], times[name], at_least=bar))
         for name, taken in times.items():
-            frames = config.frames_per_batch / taken
-            figures.append(quartiles(f"{case}: {name}", frames, "frames/s"))
+            speed = config.frames_per_batch / taken
+            figures.append(quartiles(f"{case}: {name}", speed, "frames/s"))
     return figures
