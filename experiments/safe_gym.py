@@ -33,6 +33,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
+from experiments.compiling import compiled
 from experiments.files import is_new, write_whole
 from experiments.log import Log, figures, versions
 from torchrl_safe.checkpoint import RunCheckpoints
@@ -47,7 +48,7 @@ from torchrl_safe.objectives import (
 from torchrl_safe.policy import save_policy
 
 # What may be another when a run is resumed: it changes nothing in what is learnt.
-CHANGEABLE = ("out", "logger", "resume", "compile", "eval_episodes")
+CHANGEABLE = ("out", "logger", "resume", "eval_episodes")
 # What a loss does not read once there are advantages; left out, minibatches are cut faster.
 NOT_LEARNT_FROM = ("next", "done", "terminated", "truncated", "episode_reward", "episode_cost")
 
@@ -90,8 +91,8 @@ class Config:
     eval_episodes: int = 50
     """Episodes of the final evaluation, with the deterministic policy."""
     compile: bool = True
-    """Compile the loss: half a minute at the start, then updates take a third of the time. Needs
-    a C++ compiler."""
+    """Compile the loss in long runs, if there is a C++ compiler: a minute at the start, then
+    updates take a third of the time. Of the algorithms, ppo and ppo-lagrangian can be."""
     frames_per_batch: int = 8_000
     """Steps between two updates of the policy: some whole episodes at least."""
     epochs: int = 20
@@ -301,6 +302,15 @@ def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | Violat
     return ViolationUpdater(loss, cost_limit=limits)
 
 
+def summed(loss: Callable[..., TensorDictBase]) -> Callable[[TensorDictBase], Tensor]:
+    """A loss as the one number that is minimized."""
+
+    def total(minibatch: TensorDictBase) -> Tensor:
+        return sum(value for key, value in loss(minibatch).items() if key.startswith("loss_"))
+
+    return total
+
+
 class Learner:
     """Goes through each batch in minibatches, until the policy is ``max_kl`` from what it was."""
 
@@ -327,10 +337,12 @@ class Learner:
         if algorithm.method is not None:
             self.step = TrustRegionStep(self.loss, algorithm.method, max_kl=config.max_kl)
         self.epochs = algorithm.epochs or config.epochs
-        objective = self.loss if self.step is None else self.loss.critic_losses
-        self.objective = self._summed(objective)
+        self.objective = summed(self.loss if self.step is None else self.loss.critic_losses)
+        if algorithm.compiles and config.compile:
+            steps = batches * self.epochs * (config.frames_per_batch // config.minibatch)
+            self.objective = compiled(self.objective, steps)
         # CUP has a second phase.
-        self.projection = self._summed(self.loss.projection_loss) if algorithm.projects else None
+        self.projection = summed(self.loss.projection_loss) if algorithm.projects else None
 
     def learn(self, batch: TensorDictBase) -> float:
         """Learns from a batch as the collector returns it; returns how far the policy moved."""
@@ -365,12 +377,6 @@ class Learner:
         # Last: the policy that collected the batch is the one that learnt from it.
         self.agent.standardize.update(batch["observation"])
         return kl
-
-    def _summed(self, loss: Callable[..., TensorDictBase]) -> Callable[[TensorDictBase], Tensor]:
-        def total(minibatch: TensorDictBase) -> Tensor:
-            return sum(v for k, v in loss(minibatch).items() if k.startswith("loss_"))
-
-        return torch.compile(total, dynamic=False) if self.config.compile else total
 
     def _minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
         # Each pass leaves out others of the steps that do not fill a minibatch.

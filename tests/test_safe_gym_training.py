@@ -10,7 +10,7 @@ import torch
 from torch.distributions import kl_divergence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from experiments import safe_gym, safe_gym_grid
+from experiments import compiling, safe_gym, safe_gym_grid
 from experiments.safe_gym import Config, Critic, Standardize, main, make_agent, make_env, train
 from torchrl_safe.policy import load_policy
 
@@ -275,7 +275,8 @@ def test_actions_that_are_not_continuous(tmp_path):
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script_method:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
 @pytest.mark.slow
-def test_compiled_is_the_same(tmp_path):
+def test_compiled_is_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiling, "PAYS_FROM", 0)
     agents = [
         train(replace(SMALL, compile=compiled, out=tmp_path / str(compiled)), progress=False)[0]
         for compiled in (False, True)
