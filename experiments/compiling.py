@@ -6,17 +6,17 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 
-Loss = TypeVar("Loss", bound=Callable[..., Any])
+Result = TypeVar("Result")
 #: Gradient steps from which compiling saves more time than it takes, even the first time.
 #: (Inductor keeps what it has compiled: later runs take about a third of that.)
 PAYS_FROM = 10_000
 
 
-def compiled(loss: Loss, gradient_steps: int) -> Loss:
+def compiled(loss: Callable[..., Result], gradient_steps: int) -> Callable[..., Result]:
     """Compiles a loss if that pays for as many gradient steps, and can be done here.
 
     Compiled kernels round in another way than PyTorch's own: the same seed gives another run.

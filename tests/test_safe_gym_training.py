@@ -272,8 +272,8 @@ def test_actions_that_are_not_continuous(tmp_path):
 
 
 # PyTorch's compiler uses what PyTorch and TorchRL have deprecated.
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script_method:DeprecationWarning")
-@pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::FutureWarning")
 @pytest.mark.slow
 def test_compiled_is_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr(compiling, "PAYS_FROM", 0)
