@@ -74,12 +74,18 @@ def add_rotors(spec: Any, parts: ArmParts, mass: Array) -> Array:
     return mass + rotors
 
 
-def set_gains(model: Any, mass: Array) -> None:
+def set_gains(model: Any, parts: ArmParts, mass: Array, *, limited: bool) -> None:
     """Makes the servos of each joint critically damped for what it has to move at home.
+
+    The velocity servo brakes; the position servo, which is told to lead, drives. What bounds the
+    force of the latter bounds the speed: a joint goes no faster than where both are in balance,
+    however far behind its target it has fallen.
 
     Args:
         model: the compiled world; changed in place.
+        parts: of the arm.
         mass: the diagonal of the mass matrix for joints and fingers, kg m^2 and kg.
+        limited: keep joints within their speeds.
     """
     count, stiffness, damping = len(mass), mass * _RATE**2, 2 * mass * _RATE
     position, velocity = slice(0, count), slice(count, 2 * count)
@@ -87,6 +93,11 @@ def set_gains(model: Any, mass: Array) -> None:
     model.actuator_biasprm[position, 1] = -stiffness
     model.actuator_gainprm[velocity, 0] = damping
     model.actuator_biasprm[velocity, 2] = -damping
+    # Fingers that are kept from moving need less than their speed's worth to press in full.
+    strongest = np.maximum(damping * parts.speed, parts.effort)
+    bounded = limited & np.isfinite(strongest)
+    model.actuator_forcelimited[position] = bounded
+    model.actuator_forcerange[position] = np.where(bounded, strongest, 0)[:, None] * (-1, 1)
 
 
 def fill_controls(controls: Array, current: Array, targets: Array) -> None:
@@ -97,13 +108,14 @@ def fill_controls(controls: Array, current: Array, targets: Array) -> None:
     0.6, and the rest in the next.
 
     Args:
-        controls: what is written, ``(N, s, 2 k)``.
+        controls: what is written, ``(N, s, 2 k)``: the first half; the other stays 0.
         current: where joints and fingers are, ``(N, k)``.
         targets: where they are to be after the last substep, ``(N, k)``.
     """
     substeps, count = controls.shape[1], current.shape[1]
     change = targets - current
     share = np.arange(1, substeps + 1)[:, None] / substeps
-    np.multiply(change[:, None], share, out=controls[:, :, :count])
+    # By as much as makes good for the braking at the speed of the target.
+    lead = 2 / (_RATE * substeps * SUBSTEP)
+    np.multiply(change[:, None], share + lead, out=controls[:, :, :count])
     controls[:, :, :count] += current[:, None]
-    controls[:, :, count:] = (change / (substeps * SUBSTEP))[:, None]
