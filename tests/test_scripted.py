@@ -93,19 +93,28 @@ def test_scattered_obstacles_leave_a_way_to_the_goal(make_env, arm):
 
 @pytest.mark.parametrize("arm", [PANDA, UR5], ids=["panda", "ur5"])
 def test_fingers_hold_by_friction(make_env, engine, arm):
-    """Shaken as fast as the arm can, a cube stays where it is between the fingers."""
+    """Shaken, a cube stays where it is between the fingers.
+
+    In MuJoCo it creeps: contacts keep to velocities, and what the fingers' way is curved within a
+    substep is lost. That is in proportion to the substep: with 1/240, 1/480 and 1/960 s a UR5 lost
+    7.6, 3.8 and 1.9 mm, with whatever friction. PyBullet's contacts lose a third of it.
+    """
     env = make_env(
         ArmEnv, arm, num_envs=2, obstacles=NoObstacles(), seed=0, **settings(arm, "pick")
     )
-    held = []
+    held: dict[int, list] = {0: [], 1: []}
+    # Bullet keeps a margin of a millimetre, MuJoCo's contacts give way.
+    wide, slip = {"bullet": (1.2e-3, 3e-3), "mujoco": (0.5e-3, 9e-3)}[engine]
 
     def shake(env, row):
         yield from pick(env, row)
         place = env.arm_state.ee_position[row]
         for aim in [[0, 0, 0.3], [0, -0.1, 0.3], [0, 0.1, 0.3], [-0.1, 0, 0.2]] * 2:
             yield from go(env, row, place + aim, tolerance=0.02)
-            held.append(env.arm_state.object_position[row, 0] - env.arm_state.ee_position[row])
-            np.testing.assert_allclose(env.arm_state.finger_position[row], 0.02, atol=1.5e-3)
+            state = env.arm_state
+            held[row].append(state.object_position[row, 0] - state.ee_position[row])
+            np.testing.assert_allclose(state.finger_position[row], 0.02, atol=wide)
+            assert np.ptp(state.finger_position[row]) < 1e-4
             if engine == "bullet":  # Which tells of them.
                 forces = _finger_forces(env, row)
                 assert min(forces) > 15
@@ -113,9 +122,10 @@ def test_fingers_hold_by_friction(make_env, engine, arm):
 
     success, *_ = fly(env, shake, steps=110)
     assert not success.any()
-    assert len(held) == 16
-    # Of the 20 mm between its middle and where it would fall.
-    assert np.ptp(held, axis=0).max() < 10e-3
+    for places in held.values():
+        assert len(places) == 8
+        # Of the 20 mm between its middle and where it would fall.
+        assert np.ptp(places, axis=0).max() < slip
 
 
 def _finger_forces(env, row):
@@ -144,11 +154,11 @@ def test_reset_forgets_the_object_it_is_moving(make_env, task):
         return states
 
     expected = record(fresh, 60)
-    for steps in (38, 30):
+    for steps in (36, 33):
         used.set_seed(100)
         record(used, steps)
         near = [distance(used, row, used.arm_state.object_position[row, 0]) for row in range(2)]
-        assert min(near) < 0.05, "it is reset while it touches"
+        assert max(near) < 0.05, "both are reset while they touch"
         used.set_seed(7)
         for one, other in zip(expected, record(used, 60), strict=True):
             assert all(map(np.array_equal, one, other))

@@ -19,6 +19,11 @@ _RATE = 0.5 / SUBSTEP
 # the same axis, such as the first and third of a stretched arm, make each other swing as soon as
 # both are at the end of their efforts: against each other they have next to no inertia.
 _ROTORS = 0.5
+# Light joints such as those of a wrist have at least as much as takes the motor's full effort so
+# many seconds to bring to its full speed. Else a motor that is told to be off by little would throw
+# its joint about, and one that is told to be off by much would be thrown by those before it: the
+# gains are in proportion.
+_RUN_UP = 4 * SUBSTEP
 # Fingers press with all their effort what keeps them this far from where they are to be, m.
 _SQUEEZE = 0.005
 # The effort of fingers that have no limit, N.
@@ -64,7 +69,8 @@ def add_rotors(spec: Any, parts: ArmParts, mass: Array) -> Array:
     Returns:
         The diagonal with what was added.
     """
-    rotors = _ROTORS * mass
+    run_up = np.divide(parts.effort, parts.speed) * _RUN_UP
+    rotors = np.maximum(_ROTORS * mass, np.where(np.isfinite(run_up), run_up, 0) - mass)
     efforts = parts.effort[len(parts.joints) :]
     # Fingers are as heavy as makes them as stiff as that.
     strength = np.where(np.isfinite(efforts), efforts, _FINGER_EFFORT) / _SQUEEZE
