@@ -9,6 +9,7 @@ import math
 import numpy as np
 import torch
 from tensordict import TensorDict
+from worlds import turn
 
 from torchrl_safe.envs import IIWA, PANDA, UR5, UR10, XARM6, XARM7
 
@@ -20,6 +21,12 @@ SAFE_HEIGHT, LOW = 0.33, 0.033
 # Share of the way, and of the speed, that a pilot asks for: at full speed it takes more than the
 # motors' efforts to stop within a control step.
 CALM = 0.65
+
+# Control steps that a wary pilot looks ahead; and balls that a hand fits in, with some room: their
+# centres from the tool point, and their radii, m.
+FORESIGHT = 25
+HAND = np.array([(0, 0, 0, 0.07), (0, 0, 0.05, 0.08), (0, 0, 0.12, 0.11), (0, 0, 0.2, 0.11)])
+HAND = np.vstack([HAND, [(0, 0, 0.28, 0.11)]])
 
 # Orientations of the tool that keep the arm off an obstacle beside the object. Turned by a
 # quarter, the hand shows it its narrow side; to which side, decides where the elbow of an arm
@@ -96,6 +103,70 @@ def carry(env, row, height=SAFE_HEIGHT):
 def carry_low(env, row):
     """The same, without regard for obstacles."""
     yield from carry(env, row, height=0.1)
+
+
+def wary(pilot, placements):
+    """What a pilot does, as long as there is a way back from it.
+
+    Before each control step it looks ahead at where the obstacles will be: if it does what it wants
+    to for one more step, can it then get away, up and back or straight back, without coming near
+    one? Else it goes the way that was free a step ago.
+
+    Args:
+        pilot: where to go.
+        placements: of each world's episode, by its row: see ``worlds.placements``.
+    """
+
+    def careful(env, row):
+        orders = pilot(env, row)
+        order, away = next(orders), []
+        while True:
+            tool, home = env.arm_state.ee_position[row], env._simulator.home_position
+            high = _at_height(home, SAFE_HEIGHT)
+            for ways in ([_at_height(tool, SAFE_HEIGHT), high], [home], [high]):
+                way = _along([order[0]], tool, 2)
+                way = np.concatenate([way, _along(ways, way[-1], FORESIGHT)])
+                if _is_free(env, row, placements[row], way):
+                    away = ways
+                    yield order
+                    order = next(orders, order)
+                    break
+            else:
+                while away and distance(env, row, away[0]) < 0.02:
+                    away = away[1:]
+                yield (away[0] if away else tool), order[1]
+
+    return careful
+
+
+def _along(stops, start, steps):
+    """Where the tool is after each control step on its way from stop to stop, ``(steps, 3)``."""
+    places, here = [], start
+    stops = list(stops)
+    for _ in range(steps):
+        while stops and np.abs(stops[0] - here).max() < 1e-6:
+            stops.pop(0)
+        if stops:
+            way = stops[0] - here
+            here = here + way * min(1, CALM * 0.05 / np.abs(way).max())
+        places.append(here)
+    return np.array(places)
+
+
+def _is_free(env, row, placement, way):
+    """Whether the hand, upright above the tool point, keeps clear of all obstacles on its way."""
+    times = env.arm_state.time[row] + np.arange(1, len(way) + 1) / env.control_rate
+    centre, orientation = placement.at(times)
+    for index in np.flatnonzero(placement.present):
+        shape = env.obstacles.shapes[index]
+        radius, half = shape.half_extents[0], shape.half_extents[2] - shape.half_extents[0]
+        axis = half * turn(orientation[:, index], np.array([0.0, 0.0, 1.0]))[:, None]
+        to_point = (way[:, None] + HAND[:, :3]) - centre[:, index, None]
+        along = np.clip((to_point * axis).sum(-1) / max(half**2, 1e-9), -1, 1)
+        gap = np.linalg.norm(to_point - along[..., None] * axis, axis=-1) - radius - HAND[:, 3]
+        if (gap < 0).any():
+            return False
+    return True
 
 
 def pick(env, row):
