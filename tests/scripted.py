@@ -22,11 +22,23 @@ SAFE_HEIGHT, LOW = 0.33, 0.033
 # motors' efforts to stop within a control step.
 CALM = 0.65
 
-# Control steps that a wary pilot looks ahead; and balls that a hand fits in, with some room: their
-# centres from the tool point, and their radii, m.
+# Control steps that a wary pilot looks ahead.
 FORESIGHT = 25
-HAND = np.array([(0, 0, 0, 0.07), (0, 0, 0.05, 0.08), (0, 0, 0.12, 0.11), (0, 0, 0.2, 0.11)])
-HAND = np.vstack([HAND, [(0, 0, 0.28, 0.11)]])
+
+# Balls that hold what can touch an obstacle, with some room: centres and radii, m. Of the gripper
+# in the frame of the tool, whose z axis points to the fingertips; of the arm from the tool point,
+# in the axes of the world.
+GRIPPER = [(0, 0, -0.01, 0.06), (0, 0, -0.06, 0.09), (0, 0, -0.14, 0.09), (0, 0, -0.22, 0.09)]
+HAND = [
+    *[(0, side, depth, 0.06) for side in (-0.07, 0, 0.07) for depth in (-0.03, -0.08)],
+    *[(0, 0, -0.15, 0.09), (0, 0, -0.22, 0.09)],
+]
+FOREARM = {
+    PANDA: [(-0.05, 0.1, 0.2, 0.08), (-0.1, 0.08, 0.25, 0.08)],
+    XARM7: [(-0.04, -0.1, 0.2, 0.08)],
+    UR5: [(-0.1, -0.12, 0.15, 0.08), (-0.18, -0.15, 0.2, 0.08)],
+    UR10: [(-0.1, -0.12, 0.15, 0.09), (-0.18, -0.15, 0.2, 0.09)],
+}
 
 # Orientations of the tool that keep the arm off an obstacle beside the object. Turned by a
 # quarter, the hand shows it its narrow side; to which side, decides where the elbow of an arm
@@ -124,7 +136,7 @@ def wary(pilot, placements):
             tool, home = env.arm_state.ee_position[row], env._simulator.home_position
             high = _at_height(home, SAFE_HEIGHT)
             for ways in ([_at_height(tool, SAFE_HEIGHT), high], [home], [high]):
-                way = _along([order[0]], tool, 2)
+                way = _along([order[0]], tool, 3)
                 way = np.concatenate([way, _along(ways, way[-1], FORESIGHT)])
                 if _is_free(env, row, placements[row], way):
                     away = ways
@@ -155,18 +167,27 @@ def _along(stops, start, steps):
 
 def _is_free(env, row, placement, way):
     """Whether the hand, upright above the tool point, keeps clear of all obstacles on its way."""
+    balls = _balls(env, row)
     times = env.arm_state.time[row] + np.arange(1, len(way) + 1) / env.control_rate
     centre, orientation = placement.at(times)
     for index in np.flatnonzero(placement.present):
         shape = env.obstacles.shapes[index]
         radius, half = shape.half_extents[0], shape.half_extents[2] - shape.half_extents[0]
         axis = half * turn(orientation[:, index], np.array([0.0, 0.0, 1.0]))[:, None]
-        to_point = (way[:, None] + HAND[:, :3]) - centre[:, index, None]
+        to_point = (way[:, None] + balls[:, :3]) - centre[:, index, None]
         along = np.clip((to_point * axis).sum(-1) / max(half**2, 1e-9), -1, 1)
-        gap = np.linalg.norm(to_point - along[..., None] * axis, axis=-1) - radius - HAND[:, 3]
+        gap = np.linalg.norm(to_point - along[..., None] * axis, axis=-1) - radius - balls[:, 3]
         if (gap < 0).any():
             return False
     return True
+
+
+def _balls(env, row):
+    """What can touch an obstacle, around the tool point: centres and radii, ``(b, 4)``."""
+    balls = np.array(HAND if env.arm is PANDA else GRIPPER)
+    balls[:, :3] = turn(env.arm_state.ee_orientation[row], balls[:, :3])
+    # The forearm is where these tools are not turned.
+    return np.array([*balls, *(FOREARM.get(env.arm, []) if env.arm_state.object_position.size else [])])
 
 
 def pick(env, row):
@@ -222,7 +243,11 @@ def _push_to(env, row, stop):
     while np.linalg.norm(stop - env.arm_state.object_position[row, 0]) > 0.02:
         yield from _get_behind(env, row, stop)
         here, aside = env.arm_state.object_position[row, 0], np.zeros(3)
-        while np.linalg.norm(stop - here) > 0.02 and np.linalg.norm(aside) < 0.025:
+        while (
+            np.linalg.norm(stop - here) > 0.02
+            and np.linalg.norm(aside) < 0.025
+            and env.arm_state.ee_position[row, 2] < 2 * LOW
+        ):
             here, tool = env.arm_state.object_position[row, 0], env.arm_state.ee_position[row]
             forward = _unit(_at_height(stop - here, 0))
             aside = _at_height(here - tool, 0) @ (np.eye(3) - np.outer(forward, forward))
