@@ -28,13 +28,17 @@ FORESIGHT = 25
 # Balls that hold what can touch an obstacle, with some room: centres and radii, m. Of the gripper
 # in the frame of the tool, whose z axis points to the fingertips; of the arm from the tool point,
 # in the axes of the world.
-GRIPPER = [(0, 0, -0.01, 0.06), (0, 0, -0.06, 0.09), (0, 0, -0.14, 0.09), (0, 0, -0.22, 0.09)]
+GRIPPER = [
+    *[(0, side, depth, 0.05) for side in (-0.035, 0.035) for depth in (-0.02, -0.08)],
+    *[(0, 0, -0.14, 0.075), (0, 0, -0.22, 0.08)],
+]
 HAND = [
     *[(0, side, depth, 0.06) for side in (-0.07, 0, 0.07) for depth in (-0.03, -0.08)],
     *[(0, 0, -0.15, 0.09), (0, 0, -0.22, 0.09)],
 ]
 FOREARM = {
     PANDA: [(-0.05, 0.1, 0.2, 0.08), (-0.1, 0.08, 0.25, 0.08)],
+    XARM6: [(-0.06, -0.08, 0.2, 0.08)],
     XARM7: [(-0.04, -0.1, 0.2, 0.08)],
     UR5: [(-0.1, -0.12, 0.15, 0.08), (-0.18, -0.15, 0.2, 0.08)],
     UR10: [(-0.1, -0.12, 0.15, 0.09), (-0.18, -0.15, 0.2, 0.09)],
@@ -166,7 +170,7 @@ def _along(stops, start, steps):
 
 
 def _is_free(env, row, placement, way):
-    """Whether the hand, upright above the tool point, keeps clear of all obstacles on its way."""
+    """Whether the end of the arm keeps clear of all obstacles, where the tool goes a way."""
     balls = _balls(env, row)
     times = env.arm_state.time[row] + np.arange(1, len(way) + 1) / env.control_rate
     centre, orientation = placement.at(times)
@@ -186,8 +190,9 @@ def _balls(env, row):
     """What can touch an obstacle, around the tool point: centres and radii, ``(b, 4)``."""
     balls = np.array(HAND if env.arm is PANDA else GRIPPER)
     balls[:, :3] = turn(env.arm_state.ee_orientation[row], balls[:, :3])
-    # The forearm is where these tools are not turned.
-    return np.array([*balls, *(FOREARM.get(env.arm, []) if env.arm_state.object_position.size else [])])
+    # Where the tool is held as it is for objects; straight down, nothing else comes near.
+    forearm = FOREARM.get(env.arm, []) if env.task.objects else []
+    return np.array([*balls, *forearm])
 
 
 def pick(env, row):
@@ -200,15 +205,28 @@ def pick(env, row):
         yield _at_height(place, LOW), 0.0
 
 
-def push_around(env, row):
-    """Pushes the object to the goal by way of the base, where no obstacle is."""
+def push_around(env, row, aside=0.08, near=0.17):
+    """Pushes the object to the goal by way of the base, where no obstacle is.
+
+    Args:
+        env: the environment.
+        row: number of the world.
+        aside: how much farther from the obstacle the tool keeps on its ways from and to the base.
+        near: how much nearer to the base than object and goal the object passes the obstacle.
+    """
     here, goal = env.arm_state.object_position[row, 0], _away_from_obstacles(env, row)
-    near = min(here[0], goal[0]) - 0.17
+    near = min(here[0], goal[0]) - near
     # The tool is behind what it pushes: off the straight way, farther from the obstacle.
-    aside = np.array([0, 0.08 * np.sign(goal[1] - here[1]), 0])
+    aside = np.array([0, aside * np.sign(goal[1] - here[1]), 0])
     stops = [here + aside, goal - aside]
     for stop in [*(np.array([near, *stop[1:]]) for stop in stops), goal]:
         yield from _push_to(env, row, stop)
+
+
+def push_in_time(env, row):
+    """The same past an obstacle that moves: straight from and to the base, and not so near it."""
+    aside, near = {XARM7: (0.0, 0.15), UR10: (0.08, 0.17)}.get(env.arm, (0.0, 0.17))
+    yield from push_around(env, row, aside, near)
 
 
 def push_straight(env, row):

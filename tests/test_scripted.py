@@ -3,6 +3,8 @@
 The thresholds are those of 32 episodes, measured; here are 8 of them, which always go the same.
 """
 
+import itertools
+
 import numpy as np
 import pybullet
 import pytest
@@ -17,16 +19,20 @@ from scripted import (
     over,
     pick,
     push_around,
+    push_in_time,
     push_straight,
     straight,
+    wary,
 )
-from worlds import ARMS, each_arm
+from worlds import ARMS, each_arm, placements
 
 from torchrl_safe.envs import (
     PANDA,
     UR5,
     ArmEnv,
     CartesianDelta,
+    Human,
+    Moving,
     NoObstacles,
     PickAndPlace,
     Push,
@@ -41,6 +47,7 @@ PILOTS = {
     "push": (push_around, push_straight),
     "pick": (carry, carry_low),
 }
+LAYOUTS = {"moving": Moving(), "human": Human()}
 each_task = pytest.mark.parametrize("task", PILOTS)
 
 
@@ -70,16 +77,36 @@ def settings(arm, task):
         for name, arm in ARMS.items()
     ],
 )
-def test_success_costs_nothing(make_env, engine, arm, task):
+def test_success_costs_nothing(make_env, arm, task):
     """To who looks where the obstacle is; who does not, touches it."""
     careful, careless = PILOTS[task]
     env = make_env(ArmEnv, arm, num_envs=8, seed=0, **settings(arm, task))
     success, _, cost = fly(env, careful)
     assert success.all()
-    # The Panda's hand passes the obstacle closely while it pushes: once in eight it grazes it.
-    grazes = int((engine, arm, task) == ("mujoco", PANDA, "push"))
-    assert (cost > 0).sum() <= grazes
+    assert not cost.any()
     assert (fly(env, careless, steps=100)[2] > 0).all()
+
+
+FAST = [("panda", "reach", "moving"), ("panda", "reach", "human"), ("panda", "pick", "human")]
+
+
+@pytest.mark.parametrize(
+    ("arm", "task", "layout"),
+    [
+        pytest.param(ARMS[name], task, layout, id="-".join((name, task, layout)), marks=marks)
+        for name, task, layout in itertools.product(ARMS, PILOTS, LAYOUTS)
+        for marks in [[] if (name, task, layout) in FAST else [pytest.mark.slow]]
+    ],
+)
+def test_success_costs_nothing_among_what_moves(make_env, arm, task, layout):
+    """To who waits until the way is free, and leaves it in time. It takes longer."""
+    steps = {"reach": 200, "push": 600, "pick": 400}[task]
+    chosen = {**settings(arm, task), "obstacles": LAYOUTS[layout], "max_episode_steps": steps}
+    env = make_env(ArmEnv, arm, num_envs=8, seed=0, **chosen)
+    careful = push_in_time if task == "push" else PILOTS[task][0]
+    success, _, cost = fly(env, wary(careful, placements(env)))
+    assert success.all()
+    assert not cost.any()
 
 
 @each_arm
