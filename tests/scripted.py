@@ -225,7 +225,9 @@ def push_around(env, row, aside=0.08, near=0.17):
 
 def push_in_time(env, row):
     """The same past an obstacle that moves: straight from and to the base, and not so near it."""
-    aside, near = {XARM7: (0.0, 0.15), UR10: (0.08, 0.17)}.get(env.arm, (0.0, 0.17))
+    aside, near = {IIWA: (0.0, 0.15), XARM7: (0.0, 0.15), UR10: (0.08, 0.17)}.get(
+        env.arm, (0.0, 0.17)
+    )
     yield from push_around(env, row, aside, near)
 
 
