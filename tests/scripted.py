@@ -225,10 +225,10 @@ def push_around(env, row, aside=0.08, near=0.17):
 
 def push_in_time(env, row):
     """The same past an obstacle that moves: straight from and to the base, and not so near it."""
-    aside, near = {IIWA: (0.0, 0.15), XARM7: (0.0, 0.15), UR10: (0.08, 0.17)}.get(
-        env.arm, (0.0, 0.17)
-    )
-    yield from push_around(env, row, aside, near)
+    if env.arm is UR10:
+        yield from push_around(env, row)
+    # The elbows of these cannot fold as far.
+    yield from push_around(env, row, aside=0.0, near=0.15 if env.arm in (IIWA, XARM7) else 0.17)
 
 
 def push_straight(env, row):
