@@ -225,10 +225,9 @@ def push_around(env, row, aside=0.08, near=0.17):
 
 def push_in_time(env, row):
     """The same past an obstacle that moves: straight from and to the base, and not so near it."""
-    if env.arm is UR10:
-        yield from push_around(env, row)
-    # The elbows of these cannot fold as far.
-    yield from push_around(env, row, aside=0.0, near=0.15 if env.arm in (IIWA, XARM7) else 0.17)
+    # Elbows do not fold as far everywhere; and a UR10's forearm is to keep off all the same.
+    near = 0.15 if env.arm in (IIWA, XARM7) else 0.17
+    yield from push_around(env, row, aside=0.08 if env.arm is UR10 else 0.0, near=near)
 
 
 def push_straight(env, row):
