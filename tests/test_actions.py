@@ -8,7 +8,7 @@ import pytest
 import torch
 from states import make_state
 from tensordict import TensorDict
-from worlds import each_arm, step, turn
+from worlds import ARMS, each_arm, step, turn
 
 from torchrl_safe.envs import (
     PANDA,
@@ -156,7 +156,13 @@ def efforts(env):
 
 
 @pytest.mark.parametrize("action", [CartesianDelta(), JointDelta()], ids=lambda a: type(a).__name__)
-@each_arm
+@pytest.mark.parametrize(
+    "arm",
+    [
+        pytest.param(arm, id=name, marks=() if arm is PANDA else pytest.mark.slow)
+        for name, arm in ARMS.items()
+    ],
+)
 def test_joints_keep_to_the_speeds_of_the_urdf(make_env, engine, arm, action):
     """Unless a motor's whole effort cannot hold its joint.
 
