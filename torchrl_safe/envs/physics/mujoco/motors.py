@@ -120,8 +120,11 @@ def fill_controls(controls: Array, current: Array, targets: Array) -> None:
     """
     substeps, count = controls.shape[1], current.shape[1]
     change = targets - current
-    share = np.arange(1, substeps + 1)[:, None] / substeps
-    # By as much as makes good for the braking at the speed of the target.
+    # Ahead by as much as makes good for the braking at the speed of the target.
     lead = 2 / (_RATE * substeps * SUBSTEP)
-    np.multiply(change[:, None], share + lead, out=controls[:, :, :count])
-    controls[:, :, :count] += current[:, None]
+    # Shares of what each substep adds, and of what it begins from.
+    shares = np.ones((substeps, 2))
+    shares[:, 0] = np.arange(1, substeps + 1) / substeps + lead
+    parts = np.zeros((len(current), 2, 2 * count))
+    parts[:, 0, :count], parts[:, 1, :count] = change, current
+    np.matmul(shares, parts, out=controls)
