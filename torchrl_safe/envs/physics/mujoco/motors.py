@@ -100,7 +100,8 @@ def set_gains(model: Any, parts: ArmParts, mass: Array, *, limited: bool) -> Non
     model.actuator_gainprm[velocity, 0] = damping
     model.actuator_biasprm[velocity, 2] = -damping
     # Fingers that are kept from moving need less than their speed's worth to press in full.
-    strongest = np.maximum(damping * parts.speed, parts.effort)
+    efforts = np.where(np.isfinite(parts.effort), parts.effort, _FINGER_EFFORT)
+    strongest = np.maximum(damping * parts.speed, efforts)
     bounded = limited & np.isfinite(strongest)
     model.actuator_forcelimited[position] = bounded
     model.actuator_forcerange[position] = np.where(bounded, strongest, 0)[:, None] * (-1, 1)
