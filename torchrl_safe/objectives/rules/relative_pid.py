@@ -55,7 +55,7 @@ class RelativePID(PIDControl):
         max_multiplier (float, optional): upper bound of every multiplier, ``None`` for none.
             Defaults to ``10.0``.
         pessimism (float, optional): see :class:`~torchrl_safe.objectives.MultiplierUpdater`.
-            Defaults to ``1.0``.
+            Defaults to ``2.0``.
         cost_names (sequence of str, optional): see
             :class:`~torchrl_safe.objectives.MultiplierUpdater`.
 
@@ -86,7 +86,7 @@ class RelativePID(PIDControl):
         ki: float = 0.1,
         kd: float = 0.0,
         max_multiplier: float | None = 10.0,
-        pessimism: float = 1.0,
+        pessimism: float = 2.0,
         cost_names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(
