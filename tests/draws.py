@@ -23,10 +23,10 @@ def tool_at_home(arm):
     return env.arm_state.ee_position[0]
 
 
-def misses(arm, task, home, draws, seed=0):
+def misses(arm, task, home, layouts, draws, seed=0):
     """How many draws of the task find no room, and how many of each layout for the others."""
     rng = np.random.default_rng(seed)
-    counts = dict.fromkeys(["task", *OBSTACLES], 0)
+    counts = dict.fromkeys(["task", *layouts], 0)
     for _ in range(draws):
         try:
             goal, objects = TASKS[task].sample(rng, ARMS[arm].goals)
@@ -34,9 +34,9 @@ def misses(arm, task, home, draws, seed=0):
             counts["task"] += 1
             continue
         start = objects[0] if len(objects) else home
-        for name, layout in OBSTACLES.items():
+        for name in layouts:
             try:
-                layout.sample(rng, start, goal)
+                OBSTACLES[name].sample(rng, start, goal)
             except NoRoomError:
                 counts[name] += 1
     return counts
@@ -45,13 +45,22 @@ def misses(arm, task, home, draws, seed=0):
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=10_000, help="of each combination")
+    parser.add_argument(
+        "--layouts",
+        nargs="+",
+        choices=list(OBSTACLES),
+        default=list(OBSTACLES),
+        help="as in the environments' names, '' for the default",
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     homes = {arm: tool_at_home(arm) for arm in ARMS}
     with ProcessPoolExecutor(args.workers) as pool:
         futures = {
-            (arm, task): pool.submit(misses, arm, task, homes[arm], args.draws, args.seed)
+            (arm, task): pool.submit(
+                misses, arm, task, homes[arm], args.layouts, args.draws, args.seed
+            )
             for arm, task in product(ARMS, TASKS)
         }
         for (arm, task), future in futures.items():

@@ -91,7 +91,7 @@ def test_batched_environments_draw_what_one_environment_draws():
         split.close()
 
 
-def test_multi_sync_collector_repeats_itself():
+def test_multi_sync_collector_repeats_itself(forked_workers):
     """Two worker processes of two worlds each: right shapes, and twice the same."""
     runs = []
     for _ in range(2):

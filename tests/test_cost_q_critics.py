@@ -3,10 +3,7 @@ cost critics' targets, the mixed objective, keys, states and how they plug in.""
 
 import copy
 import re
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -21,6 +18,7 @@ from off_policy import (
     networks,
     parameters,
 )
+from programs import run_code
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.utils import unravel_key
 from torch import nn
@@ -609,14 +607,7 @@ def test_outputs_can_be_selected_before_torchrl_has_built_the_parent():
         "    print(*loss.select_out_keys('loss_actor', 'loss_cost_qvalue').out_keys)\n"
         "    print(*sorted(loss(make_transitions(2)).keys()))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = run_code(code)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["loss_actor loss_cost_qvalue"] * 4
 

@@ -2,14 +2,13 @@
 
 import math
 import re
-import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from programs import run_program
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Composite, Unbounded
@@ -21,15 +20,8 @@ from torchrl_safe.policy import save_policy
 ROOT = Path(__file__).parent.parent
 
 
-def run(path, folder=None, options=()):
-    done = subprocess.run(
-        [sys.executable, *options, str(path)],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-        cwd=folder,
-    )
+def run(path, folder=None, **settings):
+    done = run_program(path, folder=folder, **settings)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
@@ -64,7 +56,7 @@ def test_readme_loop(tmp_path):
     script.write_text(short, encoding="utf-8")
     lines = re.findall(
         r"cost \[(\S+)\] multiplier \[(\S+)\]",
-        run(script, tmp_path, ["-W", "error::FutureWarning"]),
+        run(script, tmp_path, strict=FutureWarning),
     )
     assert len(lines) == 2
     multiplier = 0.0

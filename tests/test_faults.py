@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,23 @@ def arm(cost=None, **settings):
 
 
 # ---------------------------------------------------------------- workers
+
+
+@pytest.fixture(autouse=True)
+def workers_have_time_to_end(monkeypatch):
+    """TorchRL closes a worker 0.1 s after it has terminated it; a busy machine takes longer.
+
+    It then raises ValueError, "Cannot close a process while it is still running", in place of
+    what these tests wait for.
+    """
+    close = BaseProcess.close
+
+    def wait_and_close(process):
+        if process.exitcode is None:
+            process.join(60)
+        close(process)
+
+    monkeypatch.setattr(BaseProcess, "close", wait_and_close)
 
 
 @pytest.fixture

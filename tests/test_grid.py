@@ -2,12 +2,20 @@
 
 import dataclasses
 import json
+import multiprocessing
 import os
 from pathlib import Path
 
 import pytest
 
 from experiments.grid import missing, run_grid, save_results
+
+
+@pytest.fixture(autouse=True)
+def forked(monkeypatch):
+    """Spawned processes, as the grids have, take seconds to import what they need."""
+    context = multiprocessing.get_context("fork")
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: context)
 
 
 def square(number, folder):

@@ -2,22 +2,14 @@
 
 import ast
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from programs import run_code
 
 import torchrl_safe
 
 PACKAGE = Path(torchrl_safe.__file__).parent
-
-
-def run(code):
-    """Runs a program in a new process."""
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
 
 
 def load(package):
@@ -27,7 +19,7 @@ def load(package):
         "print(*(n for n in sys.modules if n.split('.')[0] == 'pybullet'\n"
         "        or n.startswith(('pybullet', 'torchrl_safe.'))))"
     )
-    done = run(code)
+    done = run_code(code)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.split())
 
@@ -47,7 +39,7 @@ def test_testing_needs_the_losses_only():
         "import torchrl_safe.testing\n"
         "print(*(n for n in sys.modules if n.startswith('torchrl_safe.')))"
     )
-    done = run(code)
+    done = run_code(code)
     assert done.returncode == 0, done.stderr
     loaded = set(done.stdout.split())
     assert "torchrl_safe.testing.suite" in loaded
@@ -63,7 +55,7 @@ def test_the_trainers_need_the_losses_only():
         "print(*(n for n in sys.modules if n.startswith(('pybullet', 'torchrl_safe.'))))\n"
         "import torchrl_safe.trainers.configs"
     )
-    done = run(code)
+    done = run_code(code)
     loaded = set(done.stdout.split())
     assert "torchrl_safe.trainers.multiplier_hook" in loaded
     packages = ("torchrl_safe.objectives", "torchrl_safe.trainers")
@@ -84,7 +76,7 @@ def test_the_transforms_need_no_simulator():
         "print(Saute(1.0, unsafe_reward=-1.0))\n"
         "ArmEnv()"
     )
-    done = run(code)
+    done = run_code(code)
     assert "Saute" in done.stdout
     needed = 'ImportError: physics=Bullet() needs PyBullet: pip install "torchrl-safe[arms]"'
     assert needed in done.stderr
@@ -107,7 +99,7 @@ def test_these_need_neither_simulator_nor_environments_nor_losses(module, needed
 
 def test_the_metrics_say_what_they_need():
     code = "import sys; sys.modules['scipy'] = None; import torchrl_safe.metrics"
-    done = run(code)
+    done = run_code(code)
     assert done.returncode != 0
     assert 'ImportError: torchrl_safe.metrics needs SciPy: pip install "torchrl-safe[metrics]"' in (
         done.stderr

@@ -3,7 +3,6 @@
 import copy
 import json
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from programs import run_code
 from tensordict import TensorDict
 from tensordict.nn import (
     AddStateIndependentNormalScale,
@@ -78,7 +78,8 @@ def test_acts_the_same_in_a_fresh_process(trained, tmp_path):
     actor, file = trained
     np.save(tmp_path / "observations.npy", OBSERVATIONS.numpy())
     arguments = [file, tmp_path / "observations.npy", tmp_path / "actions.npy"]
-    subprocess.run([sys.executable, "-c", ACT, *map(str, arguments)], cwd=tmp_path, check=True)
+    done = run_code(ACT, *arguments, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
     actions = np.load(tmp_path / "actions.npy")
     np.testing.assert_array_equal(actions, act(actor))
     assert len(np.unique(actions)) > 64

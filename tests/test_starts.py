@@ -169,7 +169,7 @@ def test_every_registered_combination_has_room(arm):
     """Drawn without physics; a million of each with `make draws ARGS="--draws 1000000"`."""
     home = tool_at_home(arm)
     for task in TASKS:
-        assert not any(misses(arm, task, home, 1_000).values()), task
+        assert not any(misses(arm, task, home, OBSTACLES, 1_000).values()), task
 
 
 @pytest.mark.slow

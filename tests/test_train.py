@@ -2,8 +2,6 @@
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import get_args
 
@@ -11,6 +9,7 @@ import pytest
 import torch
 import tyro
 from PIL import Image
+from programs import run_code
 from torchrl.checkpoint import Checkpoint
 
 from experiments.agent import make_agent
@@ -25,14 +24,8 @@ ROOT = Path(__file__).parent.parent
 
 
 def run(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.train", *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
+    code = "import runpy; runpy.run_module('experiments.train', run_name='__main__')"
+    return run_code(code, *arguments, folder=ROOT)
 
 
 KINDS = {"cpo", "cup", "ppo-saute", "td3-lagrangian"}

@@ -89,42 +89,14 @@ class SACLagrangianLoss(CostCriticsMixin, SACLoss):
     ``loss.make_cost_value_estimator(gamma=0.99)``.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
         >>> from torchrl.objectives import SoftUpdate
         >>> from torchrl_safe.objectives import DualAscent
-        >>> policy = torch.nn.Sequential(torch.nn.Linear(4, 4), NormalParamExtractor())
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=TanhNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> inputs = ["observation", "action"]
-        >>> critic = ValueOperator(MLP(6, 1, num_cells=[8]), in_keys=inputs)
-        >>> cost_critic = ValueOperator(
-        ...     MLP(6, 3, num_cells=[8]), in_keys=inputs, out_keys=["state_action_cost_value"]
-        ... )
-        >>> loss = SACLagrangianLoss(actor, critic, cost_critic, num_costs=3, target_entropy=-2.0)
+        >>> from torchrl_safe.testing import make_q_networks, make_transitions
+        >>> networks = make_q_networks(num_costs=3)
+        >>> loss = SACLagrangianLoss(*networks, num_costs=3, target_entropy=-2.0)
         >>> targets = SoftUpdate(loss, tau=0.005)
-        >>> updater = DualAscent(loss, cost_limit=torch.tensor([25.0, 5.0, 1.0]), lr=0.01)
-        >>> done = torch.zeros(5, 1, dtype=torch.bool)
-        >>> batch = TensorDict(
-        ...     observation=torch.randn(5, 4),
-        ...     action=torch.rand(5, 2),
-        ...     next=TensorDict(
-        ...         observation=torch.randn(5, 4),
-        ...         reward=torch.randn(5, 1),
-        ...         cost=torch.rand(5, 3),
-        ...         done=done,
-        ...         terminated=done,
-        ...         batch_size=[5],
-        ...     ),
-        ...     batch_size=[5],
-        ... )
-        >>> losses = loss(batch)
+        >>> updater = DualAscent(loss, cost_limit=[25.0, 5.0, 1.0], lr=0.01)
+        >>> losses = loss(make_transitions(num_costs=3))
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
         ['loss_actor', 'loss_alpha', 'loss_cost_qvalue', 'loss_qvalue']
     """

@@ -55,33 +55,11 @@ class TD3LagrangianLoss(CostCriticsMixin, TD3Loss):
         KeyError: in a call, if the batch has no cost.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.modules import MLP, Actor, ValueOperator
         >>> from torchrl.objectives import SoftUpdate
-        >>> actor = Actor(torch.nn.Sequential(torch.nn.Linear(4, 2), torch.nn.Tanh()))
-        >>> inputs = ["observation", "action"]
-        >>> critic = ValueOperator(MLP(6, 1, num_cells=[8]), in_keys=inputs)
-        >>> cost_critic = ValueOperator(
-        ...     MLP(6, 1, num_cells=[8]), in_keys=inputs, out_keys=["state_action_cost_value"]
-        ... )
-        >>> loss = TD3LagrangianLoss(actor, critic, cost_critic, bounds=(-1.0, 1.0))
+        >>> from torchrl_safe.testing import make_q_networks, make_transitions
+        >>> loss = TD3LagrangianLoss(*make_q_networks(deterministic=True), bounds=(-1.0, 1.0))
         >>> targets = SoftUpdate(loss, tau=0.005)
-        >>> done = torch.zeros(5, 1, dtype=torch.bool)
-        >>> batch = TensorDict(
-        ...     observation=torch.randn(5, 4),
-        ...     action=torch.rand(5, 2),
-        ...     next=TensorDict(
-        ...         observation=torch.randn(5, 4),
-        ...         reward=torch.randn(5, 1),
-        ...         cost=torch.rand(5, 1),
-        ...         done=done,
-        ...         terminated=done,
-        ...         batch_size=[5],
-        ...     ),
-        ...     batch_size=[5],
-        ... )
-        >>> losses = loss(batch)
+        >>> losses = loss(make_transitions())
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
         ['loss_actor', 'loss_cost_qvalue', 'loss_qvalue']
     """
