@@ -1,4 +1,4 @@
-"""Control steps of ``ArmEnv`` against bare physics, panda-gym and the original code."""
+"""Control steps in MuJoCo against PyBullet, a bare batch of MuJoCo and panda-gym."""
 
 from __future__ import annotations
 
@@ -6,189 +6,194 @@ from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
 from itertools import product
+from time import perf_counter, process_time
 from typing import Any
+from unittest import mock
 
 import gymnasium
 import numpy as np
 import panda_gym  # noqa: F401  (registers its environments)
 import torch
-from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, GymEnv
 
-from benchmarks import engines
-from benchmarks.floor import Tape
-from benchmarks.original import OriginalEnv
+from benchmarks import bullet
+from benchmarks.anatomy import anatomy
 from benchmarks.report import Figure
 from benchmarks.rollouts import Canned, episode, play, play_gym, rollout
 from benchmarks.timing import Contender, quartiles, race, ratio, timed
-from experiments.agent import make_agent
 from torchrl_safe.envs import (
-    PAPER_CARTESIAN,
-    PAPER_JOINT,
     ActionMode,
     ArmEnv,
+    Bullet,
     CartesianDelta,
+    Human,
     JointDelta,
+    MuJoCo,
     NoObstacles,
-    Scene,
-    paper_env,
+    SpeedAndSeparation,
 )
 
 _ACTIONS: dict[str, ActionMode] = {"joint": JointDelta(), "Cartesian": CartesianDelta()}
-_PAPER_ACTIONS: dict[str, ActionMode] = {"joint": PAPER_JOINT, "Cartesian": PAPER_CARTESIAN}
-# Shares of the floor's steps/s.
-_BARS = {("joint", 1): 0.5, ("joint", 12): 0.75, ("Cartesian", 1): 0.4, ("Cartesian", 12): 0.7}
-# An episode that no measurement reaches the end of: resets are timed apart.
+_AT_LEAST = {1: 4.0, 12: 3.0}
 _ENDLESS = 10**9
 _PANDA_GYM_SUBSTEPS, _PANDA_GYM_EPISODE = 20, 50
 
 
-def floor(env: ArmEnv, steps: int) -> Contender:
-    """The physics of :func:`rollout` alone, on the same worlds."""
-    tape, policy = Tape(), Canned(env, steps)
+def bare_batch(env: ArmEnv, steps: int) -> Contender:
+    """The same model, controls and sensors as in :func:`rollout`, in MuJoCo's own batch."""
+    batch, policy = env._simulator._batch, Canned(env, steps)  # type: ignore[attr-defined]
+    advance, calls = batch.rollout, []
+
+    def record(nstep: int, control: np.ndarray, **options: Any) -> Any:
+        calls.append((nstep, control.copy(), {**options, "out": None}))
+        return advance(nstep, control, **options)
+
     env.set_seed(0)
     start = env.reset()
-    with tape.recording():
+    state = batch.state.copy()
+    with mock.patch.object(batch, "rollout", record):
         play(env, policy, steps, start)
 
     def contender() -> float:
-        env.set_seed(0)
-        env.reset()
-        return tape.play()
+        batch.state[:] = state
+        out = None
+        begin = process_time()
+        for nstep, control, options in calls:
+            out = advance(nstep, control, **{**options, "out": out})
+        return process_time() - begin
 
     return contender
 
 
-def collection(env: EnvBase, steps: int) -> Contender:
-    """Steps through a collector with the policy that ``make train`` starts from."""
-    actor = make_agent(env, gamma=0.97).actor
-    frames = steps * env.batch_size.numel()
-    batches = iter(
-        Collector(
-            env,
-            actor,
-            frames_per_batch=frames,
-            total_frames=-1,
-            auto_register_policy_transforms=False,
+def against_bullet(quick: bool) -> Iterator[Figure]:
+    """Rollouts of both, and of MuJoCo alone; processor time of one thread."""
+    worlds, rounds = (2, 2) if quick else (128, 9)
+    for (name, action), substeps in product(_ACTIONS.items(), (12, 1)):
+        steps = 4 if quick else (32 if substeps == 1 else 16)
+        make = partial(
+            ArmEnv,
+            num_envs=worlds,
+            action=action,
+            frame_skip=substeps,
+            max_episode_steps=_ENDLESS,
         )
-    )
-    return timed(lambda: next(batches))
-
-
-def against_floor(quick: bool) -> Iterator[Figure]:
-    """Rollout and collector against the bare steps of the same worlds."""
-    counts, rounds = ((2,), 2) if quick else ((1, 8, 32, 64), 5)
-    for (name, action), substeps, worlds in product(_ACTIONS.items(), (1, 12), counts):
-        steps = 8 if quick else max(16, (1024 if substeps == 1 else 256) // worlds)
-        env = ArmEnv(
-            num_envs=worlds, action=action, frame_skip=substeps, max_episode_steps=_ENDLESS
-        )
-        with closing(env):
+        with closing(make(physics=Bullet())) as theirs, closing(make(physics=MuJoCo(1))) as ours:
             times = race(
                 {
-                    "floor": floor(env, steps),
-                    "rollout": rollout(env, steps),
-                    "collector": collection(env, steps),
+                    "Bullet": rollout(theirs, steps),
+                    "MuJoCo": rollout(ours, steps),
+                    "bare batch": bare_batch(ours, steps),
                 },
                 rounds=rounds,
             )
         case = f"{name}, substeps {substeps}, {worlds} worlds"
-        bar = _BARS[name, substeps] if worlds == 32 else None
-        yield ratio(f"{case}: rollout / floor", times["floor"], times["rollout"], at_least=bar)
-        yield ratio(f"{case}: collector / floor", times["floor"], times["collector"])
+        yield ratio(
+            f"{case}: MuJoCo / Bullet",
+            times["Bullet"],
+            times["MuJoCo"],
+            at_least=_AT_LEAST[substeps],
+        )
+        if substeps == 12:
+            yield ratio(
+                f"{case}: MuJoCo / its bare batch",
+                times["bare batch"],
+                times["MuJoCo"],
+                at_least=0.6,
+            )
         yield from (
-            quartiles(f"{case}: {way}", steps * worlds / seconds, "steps/s")
-            for way, seconds in times.items()
+            quartiles(f"{case}: {engine}", steps * worlds / times[engine], "steps/s")
+            for engine in ("Bullet", "MuJoCo")
         )
 
 
-def against_single_world(quick: bool) -> Iterator[Figure]:
-    """The collector with 32 worlds against the collector with one."""
-    worlds, steps, rounds = (4, 8, 2) if quick else (32, 128, 7)
-    settings: dict[str, Any] = {"action": JointDelta(), "frame_skip": 1}
-    with closing(ArmEnv(**settings)) as one, closing(ArmEnv(num_envs=worlds, **settings)) as many:
-        times = race(
-            {"one": collection(one, steps), "many": collection(many, steps)}, rounds=rounds
-        )
-    yield ratio(
-        f"joint, substeps 1: collector, {worlds} worlds / 1 world",
-        times["one"] * worlds,
-        times["many"],
-        at_least=15,
-    )
+def parts_of_a_step(quick: bool) -> Iterator[Figure]:
+    """What a step costs beside physics, and where its time goes."""
+    worlds, steps, rounds = (2, 4, 3) if quick else (128, 16, 9)
+    for name, action in _ACTIONS.items():
+        settings: dict[str, Any] = {"action": action, "max_episode_steps": _ENDLESS}
+        with closing(ArmEnv(num_envs=worlds, physics=MuJoCo(1), **settings)) as env:
+            runs = [anatomy(env, steps) for _ in range(rounds)][1:]
+        times = {part: 1e3 * np.array([run[part] for run in runs]) for part in runs[0]}
+        case = f"{name}, substeps 12, {worlds} worlds, a step of MuJoCo"
+        beside = sum(times.values()) - times["physics"]
+        yield quartiles(f"{case} beside physics", beside, "ms", at_most=1)
+        yield from (quartiles(f"{case}: {part}", spent, "ms") for part, spent in times.items())
 
 
-def against_original(quick: bool) -> Iterator[Figure]:
-    """Whole episodes of 500 steps, resets included, against the original code."""
-    worlds, steps, rounds = (2, 8, 2) if quick else (32, 500, 3)
-    for name in _ACTIONS:
-        original = OriginalEnv("joint" if name == "joint" else "cartesian")
-        lean = ArmEnv(
-            num_envs=worlds, action=_ACTIONS[name], frame_skip=1, max_episode_steps=_ENDLESS
-        )
-        paper = paper_env(_PAPER_ACTIONS[name], num_envs=worlds, max_episode_steps=_ENDLESS)
-        actions = np.random.default_rng(0).uniform(-1, 1, (steps, 7 if name == "joint" else 4))
-        with closing(original), closing(lean), closing(paper):
+def on_two_threads(quick: bool) -> Iterator[Figure]:
+    """By the clock on the wall: needs two cores that are free."""
+    worlds, steps, rounds = (2, 4, 2) if quick else (128, 16, 9)
+    for name, action in _ACTIONS.items():
+        make = partial(ArmEnv, num_envs=worlds, action=action, max_episode_steps=_ENDLESS)
+        with closing(make(physics=Bullet())) as theirs, closing(make(physics=MuJoCo(2))) as ours:
             times = race(
                 {
-                    "original": timed(partial(play_gym, original.reset, original.step, actions)),
-                    "lean": episode(lean, steps),
-                    "paper": episode(paper, steps),
+                    "Bullet": rollout(theirs, steps, clock=perf_counter),
+                    "MuJoCo": rollout(ours, steps, clock=perf_counter),
                 },
                 rounds=rounds,
             )
-        for scene, bar in (("lean", 5), ("paper", 3)):
-            yield ratio(
-                f"{name}, substeps 1, {worlds} worlds: {scene} scene / original code",
-                times["original"] * worlds,
-                times[scene],
-                at_least=bar,
-            )
+        yield ratio(
+            f"{name}, substeps 12, {worlds} worlds, wall: MuJoCo on two threads / Bullet",
+            times["Bullet"],
+            times["MuJoCo"],
+            at_least=5,
+        )
+
+
+def what_costs_cost(quick: bool) -> Iterator[Figure]:
+    """A person with speed and separation monitoring, and a cylinder that is not to be touched."""
+    worlds, steps, rounds = (2, 4, 2) if quick else (128, 16, 9)
+    make = partial(ArmEnv, num_envs=worlds, physics=MuJoCo(1), max_episode_steps=_ENDLESS)
+    costs = {"separation": SpeedAndSeparation()}
+    with closing(make()) as plain, closing(make(obstacles=Human(), costs=costs)) as human:
+        times = race(
+            {"plain": rollout(plain, steps), "human": rollout(human, steps)}, rounds=rounds
+        )
+    yield ratio(
+        f"substeps 12, {worlds} worlds: Human, SpeedAndSeparation / InFront, Collision (time)",
+        times["human"],
+        times["plain"],
+        at_most=2,
+    )
 
 
 def against_panda_gym(quick: bool) -> Iterator[Figure]:
     """Episodes of 50 steps of 20 substeps, resets included, against PandaReach-v3."""
-    worlds, rounds = (2, 2) if quick else (32, 7)
+    worlds, rounds = (2, 2) if quick else (128, 5)
     steps = 4 if quick else _PANDA_GYM_EPISODE
-    settings: dict[str, Any] = {
-        "num_envs": worlds,
-        "obstacles": NoObstacles(),
-        "frame_skip": _PANDA_GYM_SUBSTEPS,
-        "max_episode_steps": _PANDA_GYM_EPISODE,
-    }
     theirs = gymnasium.make("PandaReach-v3")
-    wrapped = GymEnv("PandaReach-v3")
-    lean, fingers = ArmEnv(**settings), ArmEnv(scene=Scene(free_fingers=True), **settings)
+    ours = ArmEnv(
+        num_envs=worlds,
+        physics=MuJoCo(1),
+        obstacles=NoObstacles(),
+        frame_skip=_PANDA_GYM_SUBSTEPS,
+        max_episode_steps=_PANDA_GYM_EPISODE,
+    )
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, 3)).astype(np.float32)
-    with closing(theirs), closing(wrapped), closing(lean), closing(fingers):
+    with closing(theirs), closing(ours):
         times = race(
             {
-                "raw": timed(partial(play_gym, theirs.reset, theirs.step, actions)),
-                "GymEnv": episode(wrapped, steps),
-                "ArmEnv": episode(lean, steps),
-                "ArmEnv with movable fingers": episode(fingers, steps),
+                "panda-gym": timed(partial(play_gym, theirs.reset, theirs.step, actions)),
+                "MuJoCo": episode(ours, steps),
             },
             rounds=rounds,
         )
-    for name, (theirs_name, bar) in product(
-        ("ArmEnv", "ArmEnv with movable fingers"), (("raw", 1.7), ("GymEnv", 2.0))
-    ):
-        yield ratio(
-            f"Cartesian, substeps {_PANDA_GYM_SUBSTEPS}, {worlds} worlds: {name} / "
-            f"panda-gym, {theirs_name}",
-            times[theirs_name] * worlds,
-            times[name],
-            at_least=bar if name == "ArmEnv" else None,
-        )
+    yield ratio(
+        f"Cartesian, substeps {_PANDA_GYM_SUBSTEPS}, {worlds} worlds: MuJoCo / panda-gym, raw",
+        times["panda-gym"] * worlds,
+        times["MuJoCo"],
+        at_least=5,
+    )
 
 
 def run(*, quick: bool) -> list[Figure]:
     """Measures all of it."""
     torch.set_num_threads(1)
     return [
-        *against_floor(quick),
-        *against_single_world(quick),
-        *against_original(quick),
+        *against_bullet(quick),
+        *on_two_threads(quick),
+        *parts_of_a_step(quick),
         *against_panda_gym(quick),
-        *engines.run(quick=quick),
+        *what_costs_cost(quick),
+        *bullet.of_floor(quick),
     ]

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from importlib import import_module
 from multiprocessing import get_context
-from typing import Literal
+from typing import Literal, get_args
 
 from benchmarks.report import Figure
 
-Part = Literal["env", "reset", "update", "training", "scaling", "control"]
-PARTS: tuple[Part, ...] = ("env", "reset", "update", "training", "scaling", "control")
+Part = Literal["env", "bullet", "reset", "update", "training", "scaling", "control"]
+PARTS: tuple[Part, ...] = get_args(Part)
 
 
 def measure(part: Part, *, quick: bool) -> list[Figure]:

@@ -12,8 +12,10 @@ from tensordict import TensorDict
 from worlds import ARMS, Places, each_arm, rest, step
 
 from torchrl_safe.envs import (
+    IIWA,
     PANDA,
     UR5,
+    XARM7,
     ArmEnv,
     Box,
     Camera,
@@ -39,6 +41,7 @@ from torchrl_safe.envs import (
 from torchrl_safe.envs.physics.mujoco import MuJoCo
 from torchrl_safe.envs.physics.mujoco.chain import Chain
 from torchrl_safe.envs.physics.mujoco.model import build_world
+from torchrl_safe.envs.physics.mujoco.readings import CONTACT_RANGE
 
 ONE = MuJoCo(threads=1)
 EVERYTHING = {
@@ -210,6 +213,31 @@ def test_fingers_that_no_action_moves_are_not_driven(make_env):
     np.testing.assert_allclose(free, 0.02 + 0.05 * 0.05, atol=1e-3)
     simulator.advance(joints, free - 0.005)
     np.testing.assert_allclose(simulator.state().finger_position, free - 0.005, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("arm", "links"),
+    [
+        (PANDA, ["panda_link1", "panda_link2"]),
+        (IIWA, ["lbr_iiwa_link_2"]),
+        (XARM7, ["link1"]),
+        # Its shoulder is a hand's breadth above the table.
+        (UR5, []),
+    ],
+    ids=["panda", "iiwa", "xarm7", "ur5"],
+)
+def test_links_that_cannot_reach_the_table_are_not_tested_against_it(arm, links):
+    model = build_world(arm, Scene(), (), (), Sensing()).model
+    pairs = [divmod(int(pair), 2**16) for pair in model.exclude_signature]
+    assert [model.body(link).name for world, link in pairs if world == 0] == links
+    data, table = mujoco.MjData(model), model.geom("table").id
+    lower, upper = np.where(model.jnt_limited, model.jnt_range.T, [[-np.pi], [np.pi]])
+    for pose in np.random.default_rng(0).uniform(lower, upper, (300, model.nq)):
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        for link in links:
+            for geom in np.flatnonzero(model.geom_bodyid == model.body(link).id).tolist():
+                assert mujoco.mj_geomDistance(model, data, table, geom, 1.0, None) > CONTACT_RANGE
 
 
 @each_arm

@@ -63,12 +63,12 @@ def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.fl
         array = np.asarray(values)
         if array.dtype.kind not in "biuf":  # Not of text or objects, which NumPy converts too.
             raise TypeError(f"no numbers: {array.dtype}")
-        array = array.astype(float)
+        array = array.astype(float, copy=False)
     except (OverflowError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{name} must be numbers of shape {shape}, got {values!r}.") from error
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}.")
-    if not (np.abs(array) <= _LARGEST).all():
+    if not np.abs(array).max(initial=0) <= _LARGEST:  # What is not a number is not either.
         raise ValueError(f"{name} must be finite, got {array}.")
     return array
 

@@ -238,7 +238,7 @@ class ArmEnv(EnvBase):
             success=Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device),
             shape=batch,
         )
-        bound = self.action_mode.bound
+        bound, self._action_shape = self.action_mode.bound, (*batch, width)
         self.action_spec = (
             Bounded(-bound, bound, (*batch, width), device=device, dtype=torch.float32)
             if np.isfinite(bound)
@@ -388,7 +388,7 @@ class ArmEnv(EnvBase):
             raise RuntimeError("This ArmEnv is closed.")
 
     def _check_action(self, action: Tensor) -> Array:
-        shape = self.action_spec.shape
+        shape = self._action_shape
         if action.shape != shape:
             raise ValueError(f"action must have shape {tuple(shape)}, got {tuple(action.shape)}.")
         if action.is_complex():

@@ -66,7 +66,8 @@ class FullObservation:
             "obstacle_present": np.ones((*relative.shape[:2], 1)),
         }
         present = state.obstacle_present[:, :, None]
-        obstacles = {name: np.where(present, part, 0) for name, part in obstacles.items()}
+        if not present.all():
+            obstacles = {name: np.where(present, part, 0) for name, part in obstacles.items()}
         if self.nearest is not None:
             distance = np.where(present[:, :, 0], np.linalg.norm(relative, axis=2), np.inf)
             order = np.argsort(distance, axis=1, kind="stable")[:, : self.nearest, None]

@@ -40,8 +40,8 @@ def multiply(first: Array, second: Array) -> Array:
         >>> multiply(half, half)
         array([ 0.,  0.,  0., -1.])
     """
-    x, y, z, w = np.moveaxis(first, -1, 0)
-    other_x, other_y, other_z, other_w = np.moveaxis(second, -1, 0)
+    x, y, z, w = (first[..., part] for part in range(4))
+    other_x, other_y, other_z, other_w = (second[..., part] for part in range(4))
     return np.stack(
         [
             w * other_x + other_w * x + (y * other_z - z * other_y),

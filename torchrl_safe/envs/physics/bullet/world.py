@@ -184,6 +184,7 @@ class World:
             self._place(body, _limbo(len(self._obstacles) + index))
         pybullet.performCollisionDetection(physicsClientId=client)
         pybullet.restoreState(self._home, physicsClientId=client)
+        self._positions = None
         self._goal = goal.tolist()
         self._present = np.flatnonzero(placement.present).tolist()
         self._placement, self._substeps = placement, 0
@@ -242,15 +243,14 @@ class World:
         forces = [0.0] * len(self._obstacles)
         measurements = []
         ways = None if self._placement.path is None else self._look_ahead(substeps)
+        present = [(index, self._obstacles[index]) for index in self._present]
+        step, find_contacts = pybullet.stepSimulation, pybullet.getContactPoints
         for substep in range(1, substeps + 1):
             if substep in (1, halfway):
                 self._drive(targets, substeps + 1 - substep)
-            pybullet.stepSimulation(physicsClientId=client)
-            for index in self._present:
-                points = pybullet.getContactPoints(
-                    arm, self._obstacles[index], physicsClientId=client
-                )
-                if points:
+            step(physicsClientId=client)
+            for index, obstacle in present:
+                if points := find_contacts(arm, obstacle, physicsClientId=client):
                     nearest, force = min(p[8] for p in points), sum(p[9] for p in points)
                     distances[index] = min(distances[index], nearest)
                     forces[index] = max(forces[index], force)
@@ -280,10 +280,12 @@ class World:
             return
         # The motors keep to a velocity, in each substep, as far as their efforts allow.
         time = SUBSTEP * remaining
-        states = pybullet.getJointStates(self._arm.body, driven, physicsClientId=self._client)
+        positions = self._positions or [state[0] for state in self._joint_states()]
+        self._positions = None
+        wanted = [(target - now) / time for target, now in zip(targets, positions, strict=False)]
         velocities = [
-            min(max((target - state[0]) / time, -fastest), fastest)
-            for target, state, fastest in zip(targets, states, self._fastest, strict=False)
+            velocity if -fastest <= velocity <= fastest else math.copysign(fastest, velocity)
+            for velocity, fastest in zip(wanted, self._fastest, strict=False)
         ]
         pybullet.setJointMotorControlArray(
             self._arm.body,
@@ -296,6 +298,7 @@ class World:
     def read(self, *, fresh: bool = False) -> list[float]:
         """Returns the state as one flat row, in the order of :meth:`read_shapes`."""
         positions, velocities, *_ = zip(*self._joint_states(), strict=True)
+        self._positions = positions
         link = self._link_state(fresh=fresh or self._options.fresh_links)
         goal = self._goal if self._brick is None else self._pose(self._brick)[0]
         if self._bodies_move:
@@ -442,7 +445,11 @@ class World:
     def _joint_states(self) -> tuple[tuple[float, float], ...]:
         return pybullet.getJointStates(self._arm.body, self._driven, physicsClientId=self._client)
 
+    # Where joints and fingers are, if nothing has moved since that was last read.
+    _positions: Vector | None = None
+
     def _set_joints(self, positions: Vector) -> None:
+        self._positions = None
         pybullet.resetJointStatesMultiDof(
             self._arm.body,
             self._driven,

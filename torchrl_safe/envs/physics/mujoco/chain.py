@@ -86,21 +86,17 @@ def quaternions(matrix: Array) -> Array:
 
     Of the two of each, that with w or else the largest part positive, as PyBullet has it.
     """
-    xx, yy, zz = matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2]
-    squares = np.stack([xx - yy - zz, yy - xx - zz, zz - xx - yy, xx + yy + zz], axis=1)
-    largest = np.where(squares[:, 3] > 0, 3, squares[:, :3].argmax(axis=1))
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.ascontiguousarray(matrix.transpose(1, 2, 0))
+    squares = np.array([xx - yy - zz, yy - xx - zz, zz - xx - yy, xx + yy + zz])
+    largest = np.where(squares[3] > 0, 3, squares[:3].argmax(axis=0))
     # A symmetric matrix of all products of two parts, times 4.
-    products = np.empty((len(matrix), 4, 4))
-    products[:, range(4), range(4)] = squares + 1
-    for one, other, row, column in ((0, 1, 0, 1), (0, 2, 0, 2), (1, 2, 1, 2)):
-        products[:, one, other] = products[:, other, one] = (
-            matrix[:, row, column] + matrix[:, column, row]
-        )
-    for part, (row, column) in enumerate(((2, 1), (0, 2), (1, 0))):
-        products[:, part, 3] = products[:, 3, part] = (
-            matrix[:, row, column] - matrix[:, column, row]
-        )
-    chosen = products[np.arange(len(matrix)), largest]
+    x2, y2, z2, w2 = squares + 1
+    x_y, x_z, y_z = xy + yx, xz + zx, yz + zy
+    x_w, y_w, z_w = zy - yz, xz - zx, yx - xy
+    products = np.array(
+        [x2, x_y, x_z, x_w, x_y, y2, y_z, y_w, x_z, y_z, z2, z_w, x_w, y_w, z_w, w2]
+    ).reshape(4, 4, -1)
+    chosen = products[largest, :, np.arange(len(matrix))]
     return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
 

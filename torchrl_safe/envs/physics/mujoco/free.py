@@ -45,6 +45,8 @@ class FreeBodies:
 
     def read(self, qpos: Array, qvel: Array) -> Ways:
         """Returns their poses and velocities, each ``(..., b, width)``."""
+        if not len(self._position):
+            return Ways(*(np.zeros((*qpos.shape[:-1], 0, width)) for width in (3, 4, 3, 3)))
         # Other ways of indexing lay the numbers out anew, and the last bit of what is computed with
         # them depends on that.
         poses, moves = qpos.take(self._position, axis=-1), qvel.take(self._velocity, axis=-1)

@@ -20,6 +20,7 @@ from torchrl_safe.envs.physics.mujoco.bodies import (
 )
 from torchrl_safe.envs.physics.mujoco.contacts import (
     exclude_overlaps,
+    exclude_unreachable,
     measure_base,
     set_options,
 )
@@ -80,6 +81,7 @@ def build_world(
     sensors = Sensors(spec, parts, shapes, sensing)
     model, data = _at_home(spec, arm, parts)
     exclude_overlaps(spec, links, model, data)
+    exclude_unreachable(spec, links, model, data, reach=CONTACT_RANGE)
     ids = [model.joint(name).id for name in parts.joints + parts.fingers]
     velocity = model.jnt_dofadr[ids]
     mass = np.zeros((model.nv, model.nv))

@@ -103,7 +103,10 @@ def fill_controls(controls: Array, current: Array, targets: Array) -> None:
     """
     substeps, count = controls.shape[1], current.shape[1]
     change = targets - current
-    share = np.arange(1, substeps + 1)[:, None] / substeps
-    np.multiply(change[:, None], share, out=controls[:, :, :count])
-    controls[:, :, :count] += current[:, None]
-    controls[:, :, count:] = (change / (substeps * SUBSTEP))[:, None]
+    # Shares of what each substep adds, and of what it begins from: positions grow, velocities stay.
+    shares = np.ones((substeps, 2))
+    shares[:, 0] = np.arange(1, substeps + 1) / substeps
+    parts = np.zeros((len(current), 2, 2 * count))
+    parts[:, 0, :count], parts[:, 1, :count] = change, current
+    parts[:, 1, count:] = change / (substeps * SUBSTEP)
+    np.matmul(shares, parts, out=controls)

@@ -14,7 +14,7 @@ from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.bodies import obstacle, thing
 from torchrl_safe.envs.physics.mujoco.chain import Chain, ToolPose
 from torchrl_safe.envs.physics.mujoco.clearance import Clearance
-from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
+from torchrl_safe.envs.physics.mujoco.engine import QUIET, batch, mujoco
 from torchrl_safe.envs.physics.mujoco.free import TO_MUJOCO, FreeBodies
 from torchrl_safe.envs.physics.mujoco.model import build_scenery, build_world
 from torchrl_safe.envs.physics.mujoco.motors import FINGER_GROUP, fill_controls
@@ -83,6 +83,7 @@ class MuJoCoSimulator:
 
         self._sizes = np.array([shape.half_extents for shape in shapes]).reshape(-1, 3)
         self._is_free = np.array([shape.mass > 0 for shape in shapes], dtype=bool)
+        self._some_free = bool(self._is_free.any())
         self._tracks = Tracks(num_envs, len(shapes), frame_skip)
         self._objects = FreeBodies(model, [thing(index) for index in range(len(objects))])
         self._free = FreeBodies(
@@ -92,8 +93,13 @@ class MuJoCoSimulator:
         self._steps = np.zeros(num_envs, dtype=int)
         self._contact_distance = np.full((num_envs, len(shapes)), np.inf)
         self._contact_force = np.zeros((num_envs, len(shapes)))
+        self._senses = sensing != Sensing()
         # What depends on where everything is after a substep needs one more look after the last.
         self._looks = bool(sensing.clearance or sensing.tool or sensing.links)
+        # Writing down takes time as well.
+        self._recorded: tuple[str, ...] = ("sensordata",)
+        if sensing.joints or (sensing.clearance and self._some_free):
+            self._recorded += ("qpos", "qvel")
         self._record: dict[str, Array] | None = None
         self._painter: Painter | None = None
         self._trace: dict[str, Array] = {}
@@ -113,13 +119,13 @@ class MuJoCoSimulator:
         self._goal[row], self._steps[row] = goal, 0
         self._contact_distance[row], self._contact_force[row] = np.inf, 0
         self._pose = None
-        if self._sensing != Sensing():
+        if self._senses:
             self._measure_now(row)
 
     def _measure_now(self, row: int) -> None:
         """Fills the trace of a world with what is measured at the beginning of an episode."""
         if self._looks:
-            with quiet():
+            with QUIET:
                 self._batch.forward([row], stage=mujoco.mjtStage.mjSTAGE_VEL)
         rows = slice(row, row + 1)
         ways = Ways(*(part[rows, None] for part in self._obstacles()))
@@ -136,7 +142,8 @@ class MuJoCoSimulator:
     def advance(self, joints: Array, fingers: Array) -> None:
         """Takes a control step towards joint targets ``(N, n)`` and finger targets ``(N, f)``."""
         tracks = self._tracks
-        self._hold_absent()
+        if self._some_free:
+            self._hold_absent()
         current = self._qpos.take(self._driven, axis=1)
         targets = current.copy()
         targets[:, : joints.shape[1]] = joints
@@ -157,12 +164,12 @@ class MuJoCoSimulator:
                 axis=2,
             )
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
-        with quiet():
+        with QUIET:
             self._record = self._batch.rollout(
                 self._frame_skip,
                 controls,
                 control_spec=int(spec),
-                record=("sensordata", "qpos", "qvel"),
+                record=self._recorded,
                 out=self._record,
             )
         self._check()
@@ -194,9 +201,11 @@ class MuJoCoSimulator:
     _fingers_rest = False
 
     def _check(self) -> None:
-        finite = np.isfinite(self._qpos).all(axis=1) & np.isfinite(self._qvel).all(axis=1)
-        warned = self._batch.warning[:, :, 1]
-        if warned.any() or not finite.all():
+        # One number that is not finite makes the sum so.
+        warning = self._batch.warning
+        if warning.any() or not np.isfinite(self._qpos.sum() + self._qvel.sum()):
+            finite = np.isfinite(self._qpos).all(axis=1) & np.isfinite(self._qvel).all(axis=1)
+            warned = warning[:, :, 1]
             rows = np.flatnonzero(warned.any(axis=1) | ~finite)
             kinds = [
                 kind.name.removeprefix("mjWARN_")
@@ -212,18 +221,18 @@ class MuJoCoSimulator:
         assert self._record is not None
         record, contacts = self._record["sensordata"], self._places["contacts"]
         self._contact_distance, self._contact_force = touches(contacts.of(record))
-        if self._sensing == Sensing():
+        if not self._senses:
             return
         if self._looks:
             # What MuJoCo records of a substep is how everything was before it.
-            with quiet():
+            with QUIET:
                 self._batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
             after = np.concatenate([record[:, 1:], self._readings[:, None]], axis=1)
         else:
             after = record
         if self._sensing.clearance:
             ways = self._ways_after(ways)
-        self._trace = self._measure(after, self._record["qpos"], ways, before=record)
+        self._trace = self._measure(after, self._record.get("qpos"), ways, before=record)
 
     def _ways_after(self, ways: Ways | None) -> Ways:
         """Where the obstacles were after each substep."""
@@ -232,7 +241,7 @@ class MuJoCoSimulator:
             return Ways(*(part[:, 1:] for part in ways))
         shape = (len(self._goal), self._frame_skip)
         now = [np.broadcast_to(p[:, None], (*shape, *p.shape[1:])) for p in self._tracks.now]
-        if self._is_free.any():
+        if self._some_free:
             present = self._tracks.present[:, None, self._is_free, None]
             moved = self._free.read(self._record["qpos"], self._record["qvel"])
             now = [part.copy() for part in now]
@@ -241,13 +250,13 @@ class MuJoCoSimulator:
         return Ways(*now)
 
     def _measure(
-        self, after: Array, qpos: Array, ways: Ways | None, before: Array | None = None
+        self, after: Array, qpos: Array | None, ways: Ways | None, before: Array | None = None
     ) -> dict[str, Array]:
         """Names what the sensors have read in every substep.
 
         Args:
             after: what they read after each, ``(k, s, width)``.
-            qpos: positions after each.
+            qpos: positions after each; not needed where no joints are measured.
             ways: obstacles after each.
             before: what they read before each.
         """
@@ -262,6 +271,7 @@ class MuJoCoSimulator:
             if name in places:
                 trace[name] = touch_distance(places[name].of(contacts))
         if sensing.joints:
+            assert qpos is not None
             trace["joint_position"] = qpos.take(self._driven[: len(self.joint_lower)], axis=-1)
         if sensing.tool:
             trace |= {
@@ -274,7 +284,7 @@ class MuJoCoSimulator:
     def _obstacles(self) -> Ways:
         """Where the obstacles are now, each ``(N, m, width)``."""
         now = Ways(*(part.copy() for part in self._tracks.now))
-        if self._is_free.any():
+        if self._some_free:
             present = self._tracks.present[:, self._is_free, None]
             for part, values in zip(now, self._free.read(self._qpos, self._qvel), strict=True):
                 part[:, self._is_free] = np.where(present, values, part[:, self._is_free])
