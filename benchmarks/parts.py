@@ -10,7 +10,9 @@ from typing import Literal, get_args
 
 from benchmarks.report import Figure
 
-Part = Literal["env", "bullet", "reset", "update", "training", "scaling", "control"]
+Part = Literal[
+    "env", "bullet", "reset", "update", "training", "make_train", "scaling", "control"
+]  # fmt: skip
 PARTS: tuple[Part, ...] = get_args(Part)
 
 

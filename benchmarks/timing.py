@@ -35,14 +35,19 @@ def timed(
     return contender
 
 
-def race(contenders: Mapping[str, Contender], *, rounds: int) -> Times:
-    """Times contenders one after the other, round by round, after a round that does not count.
+def race(contenders: Mapping[str, Contender], *, rounds: int, warm_up: bool = True) -> Times:
+    """Times contenders one after the other, round by round.
+
+    Args:
+        contenders: what is timed, by name.
+        rounds: how often.
+        warm_up: whether there is a round before that does not count.
 
     Returns:
         The seconds of each contender, ``(rounds,)``.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for index in range(rounds + 1):
+    for index in range(not warm_up, rounds + 1):
         # Garbage is collected between the rounds and in none of them.
         gc.collect()
         gc.disable()

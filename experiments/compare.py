@@ -17,7 +17,7 @@ import torch
 import tyro
 
 from experiments import train
-from experiments.config import Action, AlgorithmName, Config as TrainConfig
+from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine
 from experiments.grid import run_grid, save_results
 from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
 from torchrl_safe.metrics import worst_seed
@@ -31,6 +31,8 @@ class Config:
     """What to train."""
     action: Action = "cartesian"
     """What an action moves."""
+    physics: Engine = TrainConfig.physics
+    """Engine that simulates the arm."""
     cost_limit: float = TrainConfig.cost_limit
     """Limit of the expected cost of an episode."""
     seeds: int = 3
@@ -51,6 +53,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
         config.out / f"{algorithm}-{seed}.json": (
             TrainConfig(
                 action=config.action,
+                physics=config.physics,
                 cost_limit=config.cost_limit,
                 seed=seed,
                 frames=config.frames,

@@ -59,8 +59,9 @@ class Config:
     """Control steps to train for, with each algorithm."""
     envs: int = 32
     """Simulated worlds, shared among the workers."""
-    workers: int = 2
-    """Processes that simulate; with 1 this process does. Another number gives other episodes."""
+    workers: int | None = None
+    """Processes that simulate; with 1 this process does. By default 2 with bullet, and 1 with
+    mujoco, which has threads instead. Another number gives other episodes."""
     seed: int = 0
     """Seed of networks, environments and minibatches."""
     out: Path = dataclasses.field(
@@ -136,9 +137,19 @@ class Config:
                 )
             if name == "ppo-saute" and not self.cost_limit:
                 raise ValueError("cost_limit must be positive with ppo-saute, got 0.")
-        for name, divisor in (("envs", "workers"), ("frames_per_batch", "envs")):
-            if getattr(self, name) % getattr(self, divisor):
-                raise ValueError(
-                    f"{name} must be a multiple of {divisor}, got {getattr(self, name)} and "
-                    f"{getattr(self, divisor)}."
-                )
+        if self.envs % self.processes:
+            raise ValueError(
+                f"envs must be a multiple of workers, got {self.envs} and {self.processes}."
+            )
+        if self.frames_per_batch % self.envs:
+            raise ValueError(
+                f"frames_per_batch must be a multiple of envs, got {self.frames_per_batch} and "
+                f"{self.envs}."
+            )
+
+    @property
+    def processes(self) -> int:
+        """Processes that simulate: what ``workers`` says, or what is fastest with the engine."""
+        if self.workers is not None:
+            return self.workers
+        return 2 if self.physics == "bullet" else 1

@@ -94,6 +94,11 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
         known = {name: saved.settings[name] for name in _ENVIRONMENT}
         # Policies of before there was a choice were trained with Bullet.
         known["physics"] = config.physics or saved.settings.get("physics", "bullet")
+        if config.gui and known["physics"] != "bullet":
+            raise ValueError(
+                f"gui needs physics=bullet, got {known['physics']!r}, which has no window here: "
+                "make a video instead."
+            )
         algorithm = saved.settings["name"]
         return partial(
             train.make_env, TrainConfig(**known, algorithms=(algorithm,)), algorithm=algorithm

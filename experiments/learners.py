@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import (
     LazyTensorStorage,
     RandomSampler,
-    SamplerWithoutReplacement,
     TensorDictReplayBuffer,
 )
 from torchrl.objectives import LossModule, SoftUpdate
@@ -72,10 +71,8 @@ class OnPolicyLearner:
             linearly to 0 over ``batches``.
         batches: how many batches there will be.
         epochs: passes over each batch, in each phase.
-        frames: control steps in a batch.
         minibatch: control steps in a minibatch.
         phases: what is minimized, one after the other, each with what is to be done before.
-            Defaults to ``loss``, or to its critics where ``actor_step`` moves the actor.
         actor_step: moves the actor instead of the optimizer.
     """
 
@@ -88,13 +85,13 @@ class OnPolicyLearner:
         learning_rate: float,
         batches: int,
         epochs: int,
-        frames: int,
         minibatch: int,
-        phases: Sequence[tuple[Callable[[], None] | None, Loss]] = (),
+        phases: Sequence[tuple[Callable[[], None] | None, Loss]],
         actor_step: TrustRegionStep | None = None,
     ) -> None:
-        self.loss, self.noise, self.epochs, self.actor_step = loss, noise, epochs, actor_step
-        self.phases = phases or [(None, loss if actor_step is None else loss.critic_losses)]
+        self.loss, self.noise, self.actor_step = loss, noise, actor_step
+        self.epochs, self.minibatch = epochs, minibatch
+        self.phases = phases
         self.policy = list(actor.parameters())
         moved_here = {id(parameter) for parameter in self.policy}
         critics = [p for p in loss.parameters() if id(p) not in moved_here]
@@ -105,22 +102,18 @@ class OnPolicyLearner:
         self.schedule = torch.optim.lr_scheduler.LinearLR(
             self.optimizer, 1.0, 0.0, total_iters=batches
         )
-        self.buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(frames),
-            sampler=SamplerWithoutReplacement(),
-            batch_size=minibatch,
-        )
 
     def learn(self, batch: TensorDictBase) -> None:
         data = self.loss.estimate_advantages(batch).reshape(-1)
         if self.actor_step is not None:
             self.actor_step.step(data)
-        self.buffer.extend(data)
+        # All that the losses read of the next steps is in the advantages.
+        data = data.exclude("next")
         for prepare, loss in self.phases:
             if prepare is not None:
                 prepare()
             for _ in range(self.epochs):
-                for minibatch in self.buffer:
+                for minibatch in data[torch.randperm(len(data))].split(self.minibatch):
                     _descend(loss, minibatch, self.optimizer, self.policy)
         self.schedule.step()
         self.noise.step()
@@ -135,8 +128,7 @@ class OnPolicyLearner:
         return state if self.actor_step is None else {**state, "actor_step": self.actor_step}
 
     def memory(self) -> dict[str, Any]:
-        # The sampler shuffles for the next pass as soon as one is over; the batch is forgotten.
-        return {"sampler": self.buffer.sampler}
+        return {}  # The batch is forgotten, and its order is drawn from torch's own generator.
 
 
 class ReplayLearner:

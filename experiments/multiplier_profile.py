@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from experiments import train
-from experiments.config import Action, AlgorithmName, Config as TrainConfig, MultiplierRule
+from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, MultiplierRule
 from experiments.grid import run_grid, save_results
 from experiments.report import COLOURS
 
@@ -35,6 +35,8 @@ class Config:
     """Cost limits that each multiplier rule is given."""
     action: Action = "cartesian"
     """What an action moves."""
+    physics: Engine = TrainConfig.physics
+    """Engine that simulates the arm."""
     seeds: int = 3
     """Runs of each, with seeds from 0."""
     frames: int = TrainConfig.frames
@@ -53,6 +55,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
         config.out / f"{rule}-{value:g}-{seed}.json": (
             TrainConfig(
                 action=config.action,
+                physics=config.physics,
                 multiplier_rule=rule,
                 multiplier_init=value if rule == "fixed" else 0.0,
                 cost_limit=0.0 if rule == "fixed" else value,

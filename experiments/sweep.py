@@ -18,7 +18,7 @@ import torch
 import tyro
 
 from experiments import train
-from experiments.config import Action, AlgorithmName, Config as TrainConfig, Observation
+from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, Observation
 from experiments.grid import run_grid, save_results
 from experiments.report import COLOURS, episode_costs, mean_over_seeds, seeds_within, successes
 from torchrl_safe.metrics import mean, worst_seed
@@ -39,6 +39,8 @@ class Config:
     """What an action moves."""
     observation: Observation = "full"
     """What the policy sees."""
+    physics: Engine = TrainConfig.physics
+    """Engine that simulates the arm."""
     seeds: int = 5
     """Runs for each limit, with seeds from 0."""
     frames: int = TrainConfig.frames
@@ -63,6 +65,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
                 paper=config.paper,
                 action=action,
                 observation=config.observation,
+                physics=config.physics,
                 cost_limit=limit or 0.0,
                 seed=seed,
                 frames=config.frames,

@@ -124,17 +124,17 @@ def collecting(
         "total_frames": -1,
         "auto_register_policy_transforms": False,
     }
-    if config.workers == 1:
+    if config.processes == 1:
         env = make_env(config, config.envs, algorithm=algorithm, training=True)
         collector = ResumableCollector(env, policy, **settings)
     else:
-        worlds = config.envs // config.workers
+        worlds = config.envs // config.processes
         factory = partial(make_env, config, worlds, algorithm=algorithm, training=True)
         collector = MultiSyncCollector(
-            [factory] * config.workers, policy, **settings, collector_class=ResumableCollector
+            [factory] * config.processes, policy, **settings, collector_class=ResumableCollector
         )
     collector.set_seed(config.seed)
-    if config.workers == 1:
+    if config.processes == 1:
         # The episodes that it has begun without a seed; with workers TorchRL does so itself.
         collector.reset()
     try:

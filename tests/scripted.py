@@ -9,6 +9,7 @@ import math
 import numpy as np
 import torch
 from tensordict import TensorDict
+from worlds import turn
 
 from torchrl_safe.envs import IIWA, PANDA, UR5, UR10, XARM6, XARM7
 
@@ -20,6 +21,28 @@ SAFE_HEIGHT, LOW = 0.33, 0.033
 # Share of the way, and of the speed, that a pilot asks for: at full speed it takes more than the
 # motors' efforts to stop within a control step.
 CALM = 0.65
+
+# Control steps that a wary pilot looks ahead.
+FORESIGHT = 25
+
+# Balls that hold what can touch an obstacle, with some room: centres and radii, m. Of the gripper
+# in the frame of the tool, whose z axis points to the fingertips; of the arm from the tool point,
+# in the axes of the world.
+GRIPPER = [
+    *[(0, side, depth, 0.05) for side in (-0.035, 0.035) for depth in (-0.02, -0.08)],
+    *[(0, 0, -0.14, 0.075), (0, 0, -0.22, 0.08)],
+]
+HAND = [
+    *[(0, side, depth, 0.06) for side in (-0.07, 0, 0.07) for depth in (-0.03, -0.08)],
+    *[(0, 0, -0.15, 0.09), (0, 0, -0.22, 0.09)],
+]
+FOREARM = {
+    PANDA: [(-0.05, 0.1, 0.2, 0.08), (-0.1, 0.08, 0.25, 0.08)],
+    XARM6: [(-0.06, -0.08, 0.2, 0.08)],
+    XARM7: [(-0.04, -0.1, 0.2, 0.08)],
+    UR5: [(-0.1, -0.12, 0.15, 0.08), (-0.18, -0.15, 0.2, 0.08)],
+    UR10: [(-0.1, -0.12, 0.15, 0.09), (-0.18, -0.15, 0.2, 0.09)],
+}
 
 # Orientations of the tool that keep the arm off an obstacle beside the object. Turned by a
 # quarter, the hand shows it its narrow side; to which side, decides where the elbow of an arm
@@ -98,6 +121,80 @@ def carry_low(env, row):
     yield from carry(env, row, height=0.1)
 
 
+def wary(pilot, placements):
+    """What a pilot does, as long as there is a way back from it.
+
+    Before each control step it looks ahead at where the obstacles will be: if it does what it wants
+    to for one more step, can it then get away, up and back or straight back, without coming near
+    one? Else it goes the way that was free a step ago.
+
+    Args:
+        pilot: where to go.
+        placements: of each world's episode, by its row: see ``worlds.placements``.
+    """
+
+    def careful(env, row):
+        orders = pilot(env, row)
+        order, away = next(orders), []
+        while True:
+            tool, home = env.arm_state.ee_position[row], env._simulator.home_position
+            high = _at_height(home, SAFE_HEIGHT)
+            for ways in ([_at_height(tool, SAFE_HEIGHT), high], [home], [high]):
+                way = _along([order[0]], tool, 3)
+                way = np.concatenate([way, _along(ways, way[-1], FORESIGHT)])
+                if _is_free(env, row, placements[row], way):
+                    away = ways
+                    yield order
+                    order = next(orders, order)
+                    break
+            else:
+                while away and distance(env, row, away[0]) < 0.02:
+                    away = away[1:]
+                yield (away[0] if away else tool), order[1]
+
+    return careful
+
+
+def _along(stops, start, steps):
+    """Where the tool is after each control step on its way from stop to stop, ``(steps, 3)``."""
+    places, here = [], start
+    stops = list(stops)
+    for _ in range(steps):
+        while stops and np.abs(stops[0] - here).max() < 1e-6:
+            stops.pop(0)
+        if stops:
+            way = stops[0] - here
+            here = here + way * min(1, CALM * 0.05 / np.abs(way).max())
+        places.append(here)
+    return np.array(places)
+
+
+def _is_free(env, row, placement, way):
+    """Whether the end of the arm keeps clear of all obstacles, where the tool goes a way."""
+    balls = _balls(env, row)
+    times = env.arm_state.time[row] + np.arange(1, len(way) + 1) / env.control_rate
+    centre, orientation = placement.at(times)
+    for index in np.flatnonzero(placement.present):
+        shape = env.obstacles.shapes[index]
+        radius, half = shape.half_extents[0], shape.half_extents[2] - shape.half_extents[0]
+        axis = half * turn(orientation[:, index], np.array([0.0, 0.0, 1.0]))[:, None]
+        to_point = (way[:, None] + balls[:, :3]) - centre[:, index, None]
+        along = np.clip((to_point * axis).sum(-1) / max(half**2, 1e-9), -1, 1)
+        gap = np.linalg.norm(to_point - along[..., None] * axis, axis=-1) - radius - balls[:, 3]
+        if (gap < 0).any():
+            return False
+    return True
+
+
+def _balls(env, row):
+    """What can touch an obstacle, around the tool point: centres and radii, ``(b, 4)``."""
+    balls = np.array(HAND if env.arm is PANDA else GRIPPER)
+    balls[:, :3] = turn(env.arm_state.ee_orientation[row], balls[:, :3])
+    # Where the tool is held as it is for objects; straight down, nothing else comes near.
+    forearm = FOREARM.get(env.arm, []) if env.task.objects else []
+    return np.array([*balls, *forearm])
+
+
 def pick(env, row):
     """Closes the fingers around the object."""
     place = env.arm_state.object_position[row, 0]
@@ -108,15 +205,29 @@ def pick(env, row):
         yield _at_height(place, LOW), 0.0
 
 
-def push_around(env, row):
-    """Pushes the object to the goal by way of the base, where no obstacle is."""
+def push_around(env, row, aside=0.08, near=0.17):
+    """Pushes the object to the goal by way of the base, where no obstacle is.
+
+    Args:
+        env: the environment.
+        row: number of the world.
+        aside: how much farther from the obstacle the tool keeps on its ways from and to the base.
+        near: how much nearer to the base than object and goal the object passes the obstacle.
+    """
     here, goal = env.arm_state.object_position[row, 0], _away_from_obstacles(env, row)
-    near = min(here[0], goal[0]) - 0.17
+    near = min(here[0], goal[0]) - near
     # The tool is behind what it pushes: off the straight way, farther from the obstacle.
-    aside = np.array([0, 0.08 * np.sign(goal[1] - here[1]), 0])
+    aside = np.array([0, aside * np.sign(goal[1] - here[1]), 0])
     stops = [here + aside, goal - aside]
     for stop in [*(np.array([near, *stop[1:]]) for stop in stops), goal]:
         yield from _push_to(env, row, stop)
+
+
+def push_in_time(env, row):
+    """The same past an obstacle that moves: straight from and to the base, and not so near it."""
+    # Elbows do not fold as far everywhere; and a UR10's forearm is to keep off all the same.
+    near = 0.15 if env.arm in (IIWA, XARM7) else 0.17
+    yield from push_around(env, row, aside=0.08 if env.arm is UR10 else 0.0, near=near)
 
 
 def push_straight(env, row):
@@ -151,7 +262,11 @@ def _push_to(env, row, stop):
     while np.linalg.norm(stop - env.arm_state.object_position[row, 0]) > 0.02:
         yield from _get_behind(env, row, stop)
         here, aside = env.arm_state.object_position[row, 0], np.zeros(3)
-        while np.linalg.norm(stop - here) > 0.02 and np.linalg.norm(aside) < 0.025:
+        while (
+            np.linalg.norm(stop - here) > 0.02
+            and np.linalg.norm(aside) < 0.025
+            and env.arm_state.ee_position[row, 2] < 2 * LOW
+        ):
             here, tool = env.arm_state.object_position[row, 0], env.arm_state.ee_position[row]
             forward = _unit(_at_height(stop - here, 0))
             aside = _at_height(here - tool, 0) @ (np.eye(3) - np.outer(forward, forward))

@@ -125,6 +125,6 @@ def test_part_runs(part):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["env", "bullet", "training"])
+@pytest.mark.parametrize("part", ["env", "bullet", "training", "make_train"])
 def test_long_part_runs(part):
     test_part_runs(part)

@@ -113,8 +113,8 @@ def test_deploying_a_policy(tmp_path):
 
 def test_environments(tmp_path):
     """Each block runs by itself, and each environment in it is one."""
-    blocks = code_of("docs/environments.md")
-    assert len(blocks) == 7
+    blocks = code_of("docs/environments.md") + code_of("docs/engines.md")
+    assert len(blocks) == 8
     script = tmp_path / "environments.py"
     check = "env.reset()\nenv.close()\n"
     script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")

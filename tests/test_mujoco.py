@@ -131,6 +131,26 @@ def test_checkpoints_come_back_bit_for_bit(make_env, settings, steps):
     np.testing.assert_array_equal(numbers(second.arm_state), numbers(first.arm_state))
 
 
+@each_episode
+@pytest.mark.parametrize("history", [0, *(pytest.param(h, marks=pytest.mark.slow) for h in (1, 2))])
+def test_checkpoints_come_back_in_any_row(make_env, settings, history):
+    """Bit for bit, whatever each world went through: episodes begun at different times."""
+    rng = np.random.default_rng(history)
+    settings = {**settings, "num_envs": 3, "physics": ONE, "max_episode_steps": 1000}
+    first, second = (make_env(ArmEnv, seed=seed, **settings) for seed in (5, 6))
+    for env in (first, second):
+        env.reset()
+        for seed in range(rng.integers(1, 4)):
+            play(env, rng.integers(1, 15), seed=seed)
+            chosen = torch.as_tensor(rng.random((3, 1)) < 0.5)
+            env.reset(TensorDict({"_reset": chosen}, [3]))
+        play(env, rng.integers(0, 9), seed=7)
+    order = np.array([2, 0, 1])
+    second.set_extra_state({name: part[order] for name, part in first.get_extra_state().items()})
+    np.testing.assert_array_equal(numbers(second.arm_state), numbers(first.arm_state)[order])
+    np.testing.assert_array_equal(play(second, 20, seed=1), play(first, 20, seed=1)[:, order])
+
+
 def test_checkpoints_of_other_worlds_are_refused(make_env):
     small = make_env(ArmEnv, physics=ONE, seed=0)
     large = make_env(ArmEnv, physics=ONE, num_envs=2, seed=0)
@@ -167,6 +187,25 @@ def test_a_broken_world_is_named(make_env, tmp_path, monkeypatch, number):
     env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
     rest(env)
     assert np.isfinite(env.arm_state.joint_position).all()
+
+
+def test_a_world_that_becomes_unstable_is_named(make_env, tmp_path, monkeypatch):
+    """By an action that no motor could do."""
+    monkeypatch.chdir(tmp_path)
+    env = make_env(
+        ArmEnv,
+        num_envs=3,
+        action=JointDelta(step=1e12, respect_limits=False),
+        scene=Scene(motor_limits=False),
+        obstacles=NoObstacles(),
+        physics=ONE,
+        seed=0,
+    )
+    env.reset()
+    rest(env)
+    with pytest.raises(FloatingPointError, match=r"world 2 is not finite .* \(MuJoCo: BAD"):
+        step(env, torch.tensor([[0.0], [0.0], [1.0]]))
+    assert not list(tmp_path.iterdir())
 
 
 def test_others_hear_of_their_own_warnings(tmp_path, monkeypatch):

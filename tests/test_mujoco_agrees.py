@@ -103,9 +103,9 @@ def test_arms_move_alike(make_env, arm):
         step(one, action)
         step(other, action)
         apart.append(np.abs(other.arm_state.joint_position - one.arm_state.joint_position))
-    assert np.max(apart[0]) < 1e-3
-    assert np.median(apart[-1]) < 2e-3
-    assert np.quantile(apart, 0.95) < 5e-3
+    assert np.max(apart[0]) < 5e-4
+    assert np.median(apart[-1]) < 6e-4
+    assert np.quantile(apart, 0.95) < 2.5e-3
 
 
 @each_arm
@@ -193,21 +193,24 @@ def poses_near(arm, generator, count):
     ],
 )
 def test_a_touch_in_one_is_a_touch_in_the_other(arm):
-    """In at least 98 % of 400 poses, 2,400 for all arms; half of them touch.
+    """In at least 99 % of 400 poses, 2,400 for all arms; half of them touch.
 
-    What differs are poses within two millimetres of a touch: PyBullet adds a margin of a
-    millimetre to convex hulls, and simplifies hulls of many corners in another way.
+    What differs are poses within a millimetre of a touch: PyBullet adds that as a margin to convex
+    hulls, and simplifies hulls of many corners in another way.
     """
     generator = np.random.default_rng(0)
     same = []
     for shape in SHAPES:
         places = poses_near(arm, generator, 100)
         one, other = (touches(physics, arm, places, shape) for physics in ENGINES)
-        same += (one[:, 0] == other[:, 0]).tolist()
+        agree = one[:, 0] == other[:, 0]
+        same += agree.tolist()
+        assert (np.abs(one[~agree, 1]) < 1.5e-3).all()
+        assert (np.abs(other[~agree, 1]) < 1.5e-3).all()
         apart = (one[:, 1] > 0) & (one[:, 1] < 0.09)
-        assert np.quantile(np.abs(one[:, 1] - other[:, 1])[apart], 0.9) < 4e-3
+        assert np.quantile(np.abs(one[:, 1] - other[:, 1])[apart], 0.9) < 1.5e-3
         assert 0.02 < one[:, 0].mean() < 0.98
-    assert np.mean(same) >= 0.98
+    assert np.mean(same) >= 0.99
 
 
 def slowly(arm, task):

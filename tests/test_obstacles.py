@@ -161,8 +161,11 @@ def test_scattered_leaves_arm_and_object_free(make_env, task):
 
 
 @pytest.mark.parametrize("mass", [0.0, 1.0], ids=["fixed", "free"])
-def test_what_is_absent_is_nowhere(make_env, mass):
+def test_what_is_absent_is_nowhere(make_env, engine, mass):
     """No contact, no distance, zeros in the observation, and nothing in the picture."""
+    # MuJoCo's solver stops at a tolerance that depends on the inertia of all bodies of a model: of
+    # what stands on the table the last micrometres are others with one body more.
+    atol = 2e-5 if engine == "mujoco" and mass else 0
     here = [(0.35, 0.0, 0.2), (0.6, 0.3, 0.1)]
     shape = Cylinder(mass=mass)
     layout = Places(shape, shape, at=here, present=[False, True])
@@ -178,7 +181,7 @@ def test_what_is_absent_is_nowhere(make_env, mass):
         assert state.contact_distance[0, 0] == np.inf
         assert state.contact_force[0, 0] == 0
         assert (state.trace["clearance"][0, :, 0] == np.inf).all()
-        torch.testing.assert_close(one["cost"], other["cost"])
+        torch.testing.assert_close(one["cost"], other["cost"], atol=atol, rtol=0)
         fields = FullObservation()(state)
         for name, width in (("to", 3), ("size", 3), ("orientation", 4), ("velocity", 3)):
             name = "to_obstacle" if name == "to" else f"obstacle_{name}"

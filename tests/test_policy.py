@@ -528,6 +528,7 @@ def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):
         ({"cost_limits": (1.0, 2.0)}, "cost_limits must be one for each of the 1 costs of env"),
         ({"video": Path("a.mov")}, "video must end in .gif or .webp, got 'a.mov'"),
         ({"gui": True, "env": "mine:arm"}, "gui must not be given with env"),
+        ({"gui": True, "physics": "mujoco"}, "gui needs physics=bullet, got 'mujoco'"),
         ({"env": "mine"}, "env must be module:function, got 'mine'"),
         ({"env": "mine:joints"}, "env must have actions of shape .3,., .* got .7,."),
     ],

@@ -89,20 +89,21 @@ FOLD = {
 
 @pytest.mark.parametrize("name", ARMS)
 def test_folding_into_itself_is_a_touch(make_env, name):
+    """From the first touch on, as long as it goes on: slowly, since what meets fast rebounds."""
     env = make_env(
         ArmEnv,
         ARMS[name],
-        action=JointDelta(step=0.2),
+        action=JointDelta(step=0.05),
         obstacles=NoObstacles(),
         costs={"itself": Collision(itself=True)},
         max_episode_steps=1000,
         seed=0,
     )
     env.reset()
-    costs = np.array([step(env, FOLD[name])["cost"].item() for _ in range(40)])
-    assert not costs[0]
-    # Links slide over each other, and off each other for some steps.
-    assert costs[10:].mean() > 0.25
+    costs = np.array([step(env, FOLD[name])["cost"].item() for _ in range(36)])
+    first = costs.argmax()
+    assert 3 <= first <= 25
+    assert costs[first:].all()
     env.reset()
     assert np.isinf(env.arm_state.trace["self_distance"]).all()
     assert not rest(env)["cost"].any()

@@ -37,6 +37,17 @@ def test_sweep_leaves_table_figure_and_results(swept):
     assert len(missing(sweep.jobs(dataclasses.replace(swept, seeds=3)))) == 4
 
 
+@pytest.mark.parametrize("script", [compare, sweep, multiplier_profile])
+def test_engine_is_an_option(script, tmp_path):
+    jobs = script.jobs(script.Config(physics="mujoco", out=tmp_path))
+    assert {settings.physics for settings, _ in jobs.values()} == {"mujoco"}
+
+
+def test_the_paper_has_one_engine(tmp_path):
+    with pytest.raises(ValueError, match="physics must be bullet with paper, got mujoco"):
+        sweep.jobs(sweep.Config(paper=True, physics="mujoco", out=tmp_path))
+
+
 def made_up(limit, seed, costs, success):
     return {
         "action": "joint",

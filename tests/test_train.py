@@ -10,6 +10,7 @@ import torch
 import tyro
 from PIL import Image
 from programs import run_code
+from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
 from experiments.agent import make_agent
@@ -17,7 +18,7 @@ from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES, OffPolicy
 from experiments.config import OFF_POLICY, AlgorithmName, Config
 from experiments.learners import NoiseSchedule
 from experiments.report import table
-from experiments.train import main, make_env, train
+from experiments.train import collecting, main, make_env, train
 from torchrl_safe.policy import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -89,8 +90,8 @@ def test_checkpoint_holds_the_loss(finished):
     last = results["algorithms"]["ppo-lagrangian"]["history"][-1]
     assert loss.lagrange_multiplier.item() == pytest.approx(last["multiplier/collision"])
     assert not torch.equal(
-        before["actor_network_params.module.0.module.0.1.0.weight"],
-        loss.state_dict()["actor_network_params.module.0.module.0.1.0.weight"],
+        before["actor_network.module.0.module.0.1.0.weight"],
+        loss.state_dict()["actor_network.module.0.module.0.1.0.weight"],
     )
 
 
@@ -204,6 +205,35 @@ def test_episodes_are_cut_off_where_they_are_learnt_from_only():
         env = make_env(config, num_envs=1, training=training)
         assert env.base_env.max_episode_steps == steps
         env.close()
+
+
+def test_an_engine_with_threads_needs_no_workers():
+    assert Config().processes == 2
+    assert Config(physics="mujoco").processes == 1
+    assert Config(physics="mujoco", workers=4).processes == 4
+    assert Config(workers=1).processes == 1
+
+
+def test_each_epoch_sees_each_step_once():
+    training = make_training(epochs=3, minibatch=4)
+    seen = []
+
+    def objective(minibatch):
+        assert "next" not in minibatch
+        seen.append(minibatch["action"][:, 0].tolist())
+        return TensorDict(loss_objective=next(training.actor.parameters()).sum())
+
+    training.learner.phases = [(None, objective)]
+    config = Config(envs=5, frames_per_batch=10, workers=1)
+    with collecting(config, training.collector, "ppo") as collector:
+        batch = next(iter(collector)).clone()
+    training.learner.learn(batch)
+    assert [len(steps) for steps in seen] == [4, 4, 2] * 3
+    epochs = [[*seen[i], *seen[i + 1], *seen[i + 2]] for i in (0, 3, 6)]
+    steps = batch["action"][..., 0].flatten().tolist()
+    assert len(set(steps)) == 10
+    assert all(sorted(epoch) == sorted(steps) for epoch in epochs)
+    assert epochs[0] != epochs[1] != epochs[2]
 
 
 def test_a_fixed_multiplier_stays():

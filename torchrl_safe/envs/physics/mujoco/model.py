@@ -88,7 +88,7 @@ def build_world(
     mujoco.mj_fullM(model, data, mass)
     moved = add_rotors(spec, parts, np.diag(mass)[velocity])
     model = spec.compile()
-    set_gains(model, moved)
+    set_gains(model, parts, moved, limited=scene.motor_limits)
     return World(
         model=model,
         parts=parts,

@@ -19,6 +19,11 @@ _RATE = 0.5 / SUBSTEP
 # the same axis, such as the first and third of a stretched arm, make each other swing as soon as
 # both are at the end of their efforts: against each other they have next to no inertia.
 _ROTORS = 0.5
+# Light joints such as those of a wrist have at least as much as takes the motor's full effort so
+# many seconds to bring to its full speed. Else a motor that is told to be off by little would throw
+# its joint about, and one that is told to be off by much would be thrown by those before it: the
+# gains are in proportion.
+_RUN_UP = 4 * SUBSTEP
 # Fingers press with all their effort what keeps them this far from where they are to be, m.
 _SQUEEZE = 0.005
 # The effort of fingers that have no limit, N.
@@ -64,7 +69,8 @@ def add_rotors(spec: Any, parts: ArmParts, mass: Array) -> Array:
     Returns:
         The diagonal with what was added.
     """
-    rotors = _ROTORS * mass
+    run_up = np.divide(parts.effort, parts.speed) * _RUN_UP
+    rotors = np.maximum(_ROTORS * mass, np.where(np.isfinite(run_up), run_up, 0) - mass)
     efforts = parts.effort[len(parts.joints) :]
     # Fingers are as heavy as makes them as stiff as that.
     strength = np.where(np.isfinite(efforts), efforts, _FINGER_EFFORT) / _SQUEEZE
@@ -74,12 +80,18 @@ def add_rotors(spec: Any, parts: ArmParts, mass: Array) -> Array:
     return mass + rotors
 
 
-def set_gains(model: Any, mass: Array) -> None:
+def set_gains(model: Any, parts: ArmParts, mass: Array, *, limited: bool) -> None:
     """Makes the servos of each joint critically damped for what it has to move at home.
+
+    The velocity servo brakes; the position servo, which is told to lead, drives. What bounds the
+    force of the latter bounds the speed: a joint goes no faster than where both are in balance,
+    however far behind its target it has fallen.
 
     Args:
         model: the compiled world; changed in place.
+        parts: of the arm.
         mass: the diagonal of the mass matrix for joints and fingers, kg m^2 and kg.
+        limited: keep joints within their speeds.
     """
     count, stiffness, damping = len(mass), mass * _RATE**2, 2 * mass * _RATE
     position, velocity = slice(0, count), slice(count, 2 * count)
@@ -87,6 +99,12 @@ def set_gains(model: Any, mass: Array) -> None:
     model.actuator_biasprm[position, 1] = -stiffness
     model.actuator_gainprm[velocity, 0] = damping
     model.actuator_biasprm[velocity, 2] = -damping
+    # Fingers that are kept from moving need less than their speed's worth to press in full.
+    efforts = np.where(np.isfinite(parts.effort), parts.effort, _FINGER_EFFORT)
+    strongest = np.maximum(damping * parts.speed, efforts)
+    bounded = limited & np.isfinite(strongest)
+    model.actuator_forcelimited[position] = bounded
+    model.actuator_forcerange[position] = np.where(bounded, strongest, 0)[:, None] * (-1, 1)
 
 
 def fill_controls(controls: Array, current: Array, targets: Array) -> None:
@@ -97,16 +115,17 @@ def fill_controls(controls: Array, current: Array, targets: Array) -> None:
     0.6, and the rest in the next.
 
     Args:
-        controls: what is written, ``(N, s, 2 k)``.
+        controls: what is written, ``(N, s, 2 k)``: the first half; the other stays 0.
         current: where joints and fingers are, ``(N, k)``.
         targets: where they are to be after the last substep, ``(N, k)``.
     """
     substeps, count = controls.shape[1], current.shape[1]
     change = targets - current
-    # Shares of what each substep adds, and of what it begins from: positions grow, velocities stay.
+    # Ahead by as much as makes good for the braking at the speed of the target.
+    lead = 2 / (_RATE * substeps * SUBSTEP)
+    # Shares of what each substep adds, and of what it begins from.
     shares = np.ones((substeps, 2))
-    shares[:, 0] = np.arange(1, substeps + 1) / substeps
+    shares[:, 0] = np.arange(1, substeps + 1) / substeps + lead
     parts = np.zeros((len(current), 2, 2 * count))
     parts[:, 0, :count], parts[:, 1, :count] = change, current
-    parts[:, 1, count:] = change / (substeps * SUBSTEP)
     np.matmul(shares, parts, out=controls)

@@ -1,0 +1,39 @@
+"""A loss that is called often enough is compiled."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+
+import torch
+
+from experiments.learners import Loss
+
+#: Gradient steps from which compiling saves more time than it takes, even the first time.
+#: (Inductor keeps what it has compiled: later runs take about a third of that.)
+PAYS_FROM = 10_000
+
+
+def compiled(loss: Loss, gradient_steps: int) -> Loss:
+    """Compiles a loss if that pays for as many gradient steps, and can be done here.
+
+    Compiled kernels round in another way than PyTorch's own: the same seed gives another run.
+
+    Args:
+        loss: a loss of TorchRL, or one of its methods.
+        gradient_steps: how often it will be called.
+
+    Returns:
+        The compiled loss, or the loss as it is.
+    """
+    if gradient_steps < PAYS_FROM:
+        return loss
+    # What inductor uses.
+    compiler = os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++")
+    if shutil.which(compiler) is None:
+        print(f"No C++ compiler {compiler} here: the loss is not compiled, and slower.")
+        return loss
+    # Of each function only so many graphs are kept: not those of runs before in this process.
+    torch.compiler.reset()
+    return torch.compile(loss, fullgraph=True, dynamic=False)
