@@ -74,13 +74,12 @@ def test_pid_control_damps_the_circling(trained):
 def test_the_rule_without_units_reaches_the_optimum_with_its_defaults():
     """Reward and cost are the same here: one deviation of the one is worth one of the other.
 
-    One standard error of 512 episodes, 0.02, is what the rule stays below the limit. Means of the
-    last half over two seeds were 0.280 and 0.281, the multipliers 1.04 and 1.04.
+    Two standard errors of 512 episodes, 0.04, are what the rule stays below the limit.
     """
     loss = partial(PPOLagrangianLoss, entropy_bonus=False, normalize_cost_advantage=True)
     shares, multipliers = train_on_bandit(loss, RelativePID, num_batches=120)
     share, multiplier = shares[-60:].mean(), multipliers[-60:].mean(0)
-    assert share.item() == pytest.approx(LIMIT - 0.02, abs=0.015)
+    assert share.item() == pytest.approx(LIMIT - 0.04, abs=0.015)
     assert multiplier[0].item() == pytest.approx(1.0, abs=0.1)
     assert multiplier[1].item() == pytest.approx(0.0, abs=1e-3)
 

@@ -10,7 +10,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives import RelativePID
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 
 
 def make_updater(*multiplier, cost_limit=10.0, pessimism=0.0, **kwargs):
@@ -44,8 +44,8 @@ def step(updater, *costs):
     ],
 )
 def test_one_step_by_hand(costs, limit, violation):
-    updater = make_updater(math.e - 1, cost_limit=limit, kp=0.5, ki=0.1)
-    expected = math.exp(1 + (0.1 + 0.5) * violation) - 1
+    updater = make_updater(2.0, cost_limit=limit, kp=0.5, ki=0.1)
+    expected = 2 + (0.1 + 0.5) * violation
     torch.testing.assert_close(step(updater, *costs), torch.tensor([expected]))
 
 
@@ -53,14 +53,14 @@ def test_the_integral_stays_and_the_other_parts_do_not():
     # v is 1/2, then 1, then 0: the last rise is one half, and a fall is none.
     updater = make_updater(kp=0.5, ki=0.1, kd=0.3)
     expected = [0.05 + 0.25, 0.15 + 0.5 + 0.3 * 0.5, 0.15]
-    for cost, exponent in zip((11.0, 12.0, 10.0), expected, strict=True):
-        torch.testing.assert_close(step(updater, cost).log1p(), torch.tensor([exponent]))
+    for cost, value in zip((11.0, 12.0, 10.0), expected, strict=True):
+        torch.testing.assert_close(step(updater, cost), torch.tensor([value]))
 
 
 def test_pessimism_adds_standard_errors():
     # Mean 10 and a standard error of 1, which is half of a fifth of the limit.
     updater = make_updater(pessimism=1.0, kp=0.5, ki=0.1)
-    torch.testing.assert_close(step(updater, 9.0, 11.0).log1p(), torch.tensor([0.6 * 0.5]))
+    torch.testing.assert_close(step(updater, 9.0, 11.0), torch.tensor([0.6 * 0.5]))
 
 
 def test_the_spread_is_the_largest_so_far_slowly_forgotten():
@@ -68,8 +68,8 @@ def test_the_spread_is_the_largest_so_far_slowly_forgotten():
     updater = make_updater(kp=0.0, ki=1.0)
     step(updater, -10.0, 30.0)
     spread = math.sqrt(800)
-    exponents = [step(updater, 11.0, 11.0).log1p().item() for _ in range(2)]
-    assert exponents == pytest.approx([1 / spread, 1 / spread + 1 / (0.8 * spread + 0.2 * 2)])
+    seen = [step(updater, 11.0, 11.0).item() for _ in range(2)]
+    assert seen == pytest.approx([1 / spread, 1 / spread + 1 / (0.8 * spread + 0.2 * 2)])
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3, 1e6])
@@ -89,11 +89,11 @@ def test_costs_in_another_unit_move_the_same_multipliers(unit):
 
 @pytest.mark.parametrize("limit", [0.025, 25.0, 25_000.0])
 def test_a_limit_that_is_far_away_is_answered_within_twenty_batches(limit):
-    """From nothing to a weight of the costs of six sevenths, and back at the same pace."""
+    """From nothing to a weight of the costs of three quarters, and back at the same pace."""
     updater = make_updater(cost_limit=limit)
     for _ in range(20):
         step(updater, 50 * limit, 50 * limit)
-    assert 1 / (1 + multiplier(updater).item()) < 1 / 7
+    assert multiplier(updater).item() == pytest.approx(3.0)
     for _ in range(20):
         step(updater, 0.0, 0.0)
     assert multiplier(updater).item() == 0
@@ -103,11 +103,11 @@ def test_it_winds_up_no_further_than_its_bounds():
     updater = make_updater(max_multiplier=20.0, kp=0.5, ki=0.1)
     for _ in range(1000):
         assert step(updater, 500.0) <= 20
-    # The first batch within the limit is answered: from 21 to 21 exp(-0.6).
-    torch.testing.assert_close(step(updater, 0.0), torch.tensor([21 * math.exp(-0.6) - 1]))
+    # The first batch within the limit is answered.
+    torch.testing.assert_close(step(updater, 0.0), torch.tensor([20 - 0.6]))
     for _ in range(1000):
         assert step(updater, 0.0) >= 0
-    torch.testing.assert_close(step(updater, 500.0), torch.tensor([math.exp(0.6) - 1]))
+    torch.testing.assert_close(step(updater, 500.0), torch.tensor([0.6]))
 
 
 @pytest.mark.parametrize(("chance", "grows"), [(0.1, True), (0.025, False)])
@@ -119,7 +119,8 @@ def test_rare_costs_are_judged_by_their_mean(chance, grows):
     for _ in range(300):
         updater.step(10 * (torch.rand(16, 1, generator=generator) < chance).float())
         seen.append(multiplier(updater).item())
-    assert min(seen[200:]) > 10 if grows else sum(seen[200:]) / 100 < 1
+    mean = sum(seen[200:]) / 100
+    assert mean > 8 if grows else mean < 1
 
 
 @pytest.mark.parametrize("limit", [0.0, 1.0])
@@ -130,7 +131,7 @@ def test_it_stays_finite_and_comes_back(cost, limit):
     for episode_cost in (cost * spread, torch.tensor([[cost]])):
         for _ in range(20):
             updater.step(episode_cost)
-            assert 0 <= multiplier(updater).item() <= 100
+            assert 0 <= multiplier(updater).item() <= 10
     if limit:
         # The spread forgets a fifth in each batch: 3e20 in some 220.
         for _ in range(400):
@@ -151,9 +152,9 @@ def test_each_cost_for_itself():
 
 
 def test_a_multiplier_set_by_hand_is_where_it_goes_on():
-    updater, twin = make_updater(kp=0.0), make_updater(math.e - 1, kp=0.0)
+    updater, twin = make_updater(kp=0.0), make_updater(1.5, kp=0.0)
     step(updater, 30.0)
-    updater.loss_module.lagrange_multiplier.fill_(math.e - 1)
+    updater.loss_module.lagrange_multiplier.fill_(1.5)
     torch.testing.assert_close(step(updater, 11.0), step(twin, 11.0))
 
 
@@ -179,7 +180,7 @@ def test_a_restored_rule_continues_identically():
 
 
 @pytest.mark.parametrize("name", ["kp", "ki", "kd", "pessimism", "cost_limit", "max_multiplier"])
-@pytest.mark.parametrize("value", [-1.0, NAN, INF])
+@pytest.mark.parametrize("value", [-1.0, NAN])
 def test_bad_numbers_are_named(name, value):
     with pytest.raises(ValueError, match=f"{name} must"):
         make_updater(**{name: value})

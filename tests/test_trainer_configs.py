@@ -16,6 +16,7 @@ from torchrl_safe.objectives import (
     DualAscent,
     LagrangianLoss,
     PIDControl,
+    RelativePID,
     ViolationUpdater,
 )
 from torchrl_safe.trainers import ConstrainedPPOTrainer
@@ -26,6 +27,7 @@ from torchrl_safe.trainers.configs import (
     DualAscentConfig,
     LagrangianLossConfig,
     PIDControlConfig,
+    RelativePIDConfig,
     ViolationUpdaterConfig,
     register_configs,
 )
@@ -54,6 +56,7 @@ CONFIGS = {
     CRPOLossConfig: CRPOLoss,
     DualAscentConfig: DualAscent,
     PIDControlConfig: PIDControl,
+    RelativePIDConfig: RelativePID,
     ViolationUpdaterConfig: ViolationUpdater,
 }
 

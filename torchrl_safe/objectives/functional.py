@@ -110,13 +110,16 @@ def cost_advantage_scale(
         (tensor([4.2426]), tensor([4.1578]))
     """
     rows = tuple(range(cost_advantage.ndim - 1))
-    largest = cost_advantage.abs() if counted is None else cost_advantage.abs() * counted
+    if counted is not None:  # What does not count may be NaN.
+        counted = counted.expand_as(cost_advantage)
+        cost_advantage = torch.where(counted, cost_advantage, 0.0)
     # Near the ends of single precision squares would be 0 or infinite.
-    unit = largest.amax(rows).clamp_min(torch.finfo(cost_advantage.dtype).tiny)
+    unit = cost_advantage.abs().amax(rows).clamp_min(torch.finfo(cost_advantage.dtype).tiny)
     values = centred(cost_advantage / unit, counted)
-    count = torch.tensor(values[..., 0].numel())
-    if counted is not None:
-        values, count = values * counted, counted.sum()
+    if counted is None:
+        count = torch.tensor(values[..., 0].numel())
+    else:
+        values, count = torch.where(counted, values, 0.0), counted.sum(rows)
     # Unbiased, and 0 for a single step.
     current = unit * (values.square().sum(rows) / (count - 1).clamp_min(1)).sqrt()
     return torch.maximum(current, past.lerp(current, 1 - memory))

@@ -11,6 +11,7 @@ After :func:`register_configs` the groups of TorchRL have these names too, and t
 ``loss=crpo``                   :class:`~torchrl_safe.objectives.CRPOLoss`, the same
 ``updater=dual_ascent``         :class:`~torchrl_safe.objectives.DualAscent`
 ``updater=pid_control``         :class:`~torchrl_safe.objectives.PIDControl`
+``updater=relative_pid``        :class:`~torchrl_safe.objectives.RelativePID`
 ``updater=violation``           :class:`~torchrl_safe.objectives.ViolationUpdater`, for CRPO
 ``trainer=constrained_ppo``      :class:`~torchrl_safe.trainers.ConstrainedPPOTrainer`
 =============================== ==============================================================
@@ -91,6 +92,7 @@ class LagrangianLossConfig(WrappingLossConfig):
     """Configuration of :class:`~torchrl_safe.objectives.LagrangianLoss`."""
 
     multiplier_init: Any = 0.0
+    normalize_cost_advantage: bool = False
     _target_: str = "torchrl_safe.objectives.LagrangianLoss"
 
 
@@ -154,6 +156,18 @@ class PIDControlConfig(UpdaterConfig):
     _target_: str = "torchrl_safe.objectives.PIDControl"
 
 
+@dataclass
+class RelativePIDConfig(UpdaterConfig):
+    """Configuration of :class:`~torchrl_safe.objectives.RelativePID`."""
+
+    kp: float = 1.0
+    ki: float = 0.1
+    kd: float = 0.0
+    max_multiplier: float | None = 10.0
+    pessimism: float = 2.0
+    _target_: str = "torchrl_safe.objectives.RelativePID"
+
+
 @dataclass(kw_only=True)  # The parent has fields without a default behind these.
 class ConstrainedPPOTrainerConfig(PPOTrainerConfig):
     """Configuration of :class:`~torchrl_safe.trainers.ConstrainedPPOTrainer`.
@@ -210,5 +224,6 @@ def register_configs() -> None:
     store(group="loss", name="crpo", node=CRPOLossConfig)
     store(group="updater", name="dual_ascent", node=DualAscentConfig)
     store(group="updater", name="pid_control", node=PIDControlConfig)
+    store(group="updater", name="relative_pid", node=RelativePIDConfig)
     store(group="updater", name="violation", node=ViolationUpdaterConfig)
     store(group="trainer", name="constrained_ppo", node=ConstrainedPPOTrainerConfig)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives.rules.multipliers import MultiplierUpdater
+from torchrl_safe.objectives.rules.pid_control import PIDControl
 
 # A kept limit is judged no more finely than this, however little the costs vary.
 _SHARE_OF_LIMIT = 0.2
 
 
-class RelativePID(MultiplierUpdater):
+class RelativePID(PIDControl):
     r"""Control of the multipliers that needs no tuning: nothing in it has a unit.
 
     With the mean episode cost :math:`J`, the limit :math:`d` and the standard deviation
@@ -25,17 +22,15 @@ class RelativePID(MultiplierUpdater):
 
     .. math::
         v &= \mathrm{clip}\left(\frac{J - d}{\max(\sigma_J,\ 0.2\, d)},\ -1,\ 1\right) \\
-        I &\leftarrow \mathrm{clip}(I + k_i v,\ 0,\ \log(1 + \mathrm{max})) \\
-        \log(1 + \lambda) &\leftarrow \mathrm{clip}(I + k_p v
-            + k_d (v - v_\mathrm{previous})_+,\ 0,\ \log(1 + \mathrm{max}))
+        I &\leftarrow \mathrm{clip}(I + k_i v,\ 0,\ \mathrm{max}) \\
+        \lambda &\leftarrow \mathrm{clip}(I + k_p v
+            + k_d (v - v_\mathrm{previous})_+,\ 0,\ \mathrm{max})
 
-    This is the control of Stooke, Achiam, Abbeel 2020 (https://arxiv.org/abs/2007.03964) with two
-    changes. The violation is **relative**: a limit that is far away is approached at the same pace
-    whether costs are thousands or thousandths, and the noise of a batch counts for as much as the
-    costs of single episodes vary. And it acts on :math:`\log(1 + \lambda)`: since
-    :func:`~torchrl_safe.objectives.penalized_advantage` gives the reward the weight
-    :math:`1 / (1 + \lambda)`, a constant violation takes the same share of that weight in each
-    batch, whether the multiplier that keeps the limit is 0.1 or 10.
+    This is :class:`~torchrl_safe.objectives.PIDControl` (Stooke, Achiam, Abbeel 2020) with a
+    **relative** violation: a limit that is far away is approached at the same pace whether costs
+    are thousands or thousandths, and the noise of a batch counts for as much as the costs of
+    single episodes vary. The multiplier is bounded, since one that has grown while the task was
+    not learnt yet would leave the reward no weight to learn it.
 
     :math:`\sigma_J` is the largest of all batches so far, of which each new one forgets a fifth:
     divided by its own alone, a batch with few costs would count for more than one with many, and
@@ -47,18 +42,22 @@ class RelativePID(MultiplierUpdater):
     times 1,000, or rewards times 100, give the same multipliers.
 
     Args:
-        loss_module (LossModule): see :class:`MultiplierUpdater`. Its multiplier is where the
-            integral starts.
+        loss_module (LossModule): see :class:`~torchrl_safe.objectives.MultiplierUpdater`. Its
+            multiplier is where the integral starts.
 
     Keyword Args:
-        cost_limit (float, Tensor or Mapping): see :class:`MultiplierUpdater`. Not negative.
-        kp (float, optional): proportional gain. Defaults to ``0.5``.
-        ki (float, optional): integral gain, for each batch. Defaults to ``0.1``: twenty batches
-            far above the limit take the multiplier from 0 to :math:`e^2 - 1 = 6.4`.
+        cost_limit (float, Tensor or Mapping): see
+            :class:`~torchrl_safe.objectives.MultiplierUpdater`. Not negative.
+        kp (float, optional): proportional gain. Defaults to ``1.0``.
+        ki (float, optional): integral gain, for each batch. Defaults to ``0.1``: far above the
+            limit the multiplier is 1.1 after the first batch and 3 after twenty.
         kd (float, optional): derivative gain. Defaults to ``0.0``.
-        max_multiplier (float, optional): upper bound of every multiplier. Defaults to ``100.0``.
-        pessimism (float, optional): see :class:`MultiplierUpdater`. Defaults to ``1.0``.
-        cost_names (sequence of str, optional): see :class:`MultiplierUpdater`.
+        max_multiplier (float, optional): upper bound of every multiplier, ``None`` for none.
+            Defaults to ``10.0``.
+        pessimism (float, optional): see :class:`~torchrl_safe.objectives.MultiplierUpdater`.
+            Defaults to ``2.0``.
+        cost_names (sequence of str, optional): see
+            :class:`~torchrl_safe.objectives.MultiplierUpdater`.
 
     Raises:
         ValueError: if a limit or gain is negative or not finite.
@@ -72,8 +71,8 @@ class RelativePID(MultiplierUpdater):
         >>> loss.register_buffer("lagrange_multiplier", torch.zeros(2))
         >>> updater = RelativePID(loss, cost_limit=torch.tensor([25.0, 0.025]), pessimism=0.0)
         >>> updater.step(torch.tensor([[26.0, 0.026], [28.0, 0.028]]))  # v = 2 / 5, twice
-        >>> loss.lagrange_multiplier  # exp(0.1 * 0.4 + 0.5 * 0.4) - 1
-        tensor([0.2712, 0.2712])
+        >>> loss.lagrange_multiplier  # 0.1 * 0.4 + 1.0 * 0.4
+        tensor([0.4400, 0.4400])
     """
 
     _forgotten = 0.2
@@ -83,44 +82,27 @@ class RelativePID(MultiplierUpdater):
         loss_module: LossModule,
         *,
         cost_limit: float | Tensor | Mapping[str, float],
-        kp: float = 0.5,
+        kp: float = 1.0,
         ki: float = 0.1,
         kd: float = 0.0,
-        max_multiplier: float = 100.0,
-        pessimism: float = 1.0,
+        max_multiplier: float | None = 10.0,
+        pessimism: float = 2.0,
         cost_names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(
             loss_module,
             cost_limit=cost_limit,
-            max_multiplier=check_number("max_multiplier", max_multiplier, positive=True),
+            kp=kp,
+            ki=ki,
+            kd=kd,
+            max_multiplier=max_multiplier,
             pessimism=pessimism,
             normalize=True,
             cost_names=cost_names,
         )
-        self.kp, self.ki, self.kd = (
-            check_number(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd))
-        )
-        multiplier = loss_module.lagrange_multiplier
-        self.integral = multiplier.log1p()
-        # NaN until there has been a batch.
-        self.last_violation = torch.full_like(multiplier, math.nan)
-        self.last_multiplier = multiplier.clone()
 
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
-        violation = violation.clamp(-1, 1)
-        previous = self.last_violation.to(multiplier)
-        rise = torch.where(previous.isnan(), 0.0, violation - previous).clamp_min(0)
-        bound = math.log1p(self.max_multiplier)
-        # As in DualAscent, an assigned or loaded multiplier is never overwritten by a stale one.
-        assigned = multiplier.log1p() - self.last_multiplier.to(multiplier).log1p()
-        integral = self.integral.to(multiplier) + assigned + self.ki * violation
-        integral = integral.clamp(0, bound)
-        proposal = (integral + self.kp * violation + self.kd * rise).clamp(0, bound).expm1()
-        # Rounded, the inverse of log1p may be a little more than the bound.
-        proposal = proposal.clamp_max(self.max_multiplier)
-        self.integral, self.last_violation, self.last_multiplier = integral, violation, proposal
-        return proposal
+        return super().next_multiplier(multiplier, violation.clamp(-1, 1))
 
     def _scale_of(self, episode_cost: Tensor) -> Tensor:
         limit, mean = self.cost_limit.to(episode_cost), episode_cost.mean(0)
@@ -130,19 +112,3 @@ class RelativePID(MultiplierUpdater):
         # Under a limit of 0 costs that are all the same have no other scale.
         scale = torch.where(scale > 0, scale, mean)
         return scale.clamp_max(torch.finfo(scale.dtype).max)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            **super().state_dict(),
-            "gains": torch.tensor([self.kp, self.ki, self.kd], dtype=torch.float64),
-            "integral": self.integral.clone(),
-            "last_violation": self.last_violation.clone(),
-            "last_multiplier": self.last_multiplier.clone(),
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        super().load_state_dict(state_dict)
-        self.kp, self.ki, self.kd = state_dict["gains"].tolist()
-        self.integral = state_dict["integral"].clone()
-        self.last_violation = state_dict["last_violation"].clone()
-        self.last_multiplier = state_dict["last_multiplier"].clone()
