@@ -39,7 +39,7 @@ class Slide(gymnasium.Env):
         return self.observe(), self.speed * self.reward_size, False, truncated, info
 
 
-class Discreet(Slide):
+class Silent(Slide):
     """Has no continuous actions."""
 
     action_space = Discrete(2)
@@ -47,4 +47,4 @@ class Discreet(Slide):
 
 gymnasium.register("Slide-v0", Slide)
 gymnasium.register("SlideScaled-v0", lambda: Slide(reward_size=128.0, cost_size=1024.0))
-gymnasium.register("Discreet-v0", Discreet)
+gymnasium.register("Silent-v0", Silent)

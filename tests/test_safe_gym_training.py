@@ -268,7 +268,7 @@ def test_settings_that_make_no_sense(changes, message):
 
 def test_actions_that_are_not_continuous(tmp_path):
     with pytest.raises(ValueError, match="continuous actions"):
-        train(replace(SMALL, env="sliding:Discreet-v0", out=tmp_path), progress=False)
+        train(replace(SMALL, env="sliding:Silent-v0", out=tmp_path), progress=False)
 
 
 # PyTorch's compiler uses what PyTorch and TorchRL have deprecated.
