@@ -129,9 +129,12 @@ def measure_round(config: Config) -> dict[tuple[int, str], tuple[float, float]]:
             start_worker(root, Path(folder) / name, config)
             for name, root in (("mine", here), ("other", config.against))
         ]
-        for _ in range(config.turns):
+        for turn in range(config.turns):
+            # Each is the first as often as the second.
+            order = (0, 1) if turn % 2 else (1, 0)
             for size, name in cases:
-                pairs[size, name].append([ask(worker, name, size) for worker in workers])
+                seconds = {index: ask(workers[index], name, size) for index in order}
+                pairs[size, name].append([seconds[0], seconds[1]])
         for worker in workers:
             worker.terminate()
     return {
