@@ -15,7 +15,6 @@ from typing import Any
 import omnisafe
 import torch
 import tyro
-from torchrl.collectors import Collector
 
 from benchmarks.report import Figure, table
 from benchmarks.timing import Contender, race, ratio, timed
@@ -96,15 +95,7 @@ def our_batches(config: safe_gym.Config) -> tuple[safe_gym.Agent, Iterator[Any]]
     """Our networks and collector."""
     env = safe_gym.make_env(config)
     agent = safe_gym.make_agent(env, config.log_std)
-    collector = Collector(
-        env,
-        agent.explorer,
-        frames_per_batch=config.frames_per_batch,
-        total_frames=-1,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
-    return agent, iter(collector)
+    return agent, iter(safe_gym.make_collector(config, env, agent))
 
 
 def collection(config: Config) -> list[Figure]:

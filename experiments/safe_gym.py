@@ -292,6 +292,18 @@ def make_env(config: Config) -> EnvBase:
     return env.append_transform(RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
 
 
+def make_collector(config: Config, env: EnvBase, agent: Agent) -> Collector:
+    """Makes what collects a batch after the other, without end."""
+    return Collector(
+        env,
+        agent.explorer,
+        frames_per_batch=config.frames_per_batch,
+        total_frames=-1,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
+
+
 def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | ViolationUpdater | None:
     """Makes what tells the loss of the episode costs of each batch."""
     wanted, limits = ALGORITHMS[config.algorithm].updater, torch.tensor(config.cost_limit)
@@ -439,14 +451,7 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     else:
         checkpoints.clear()
     log.open()
-    collector = Collector(
-        env,
-        agent.explorer,
-        frames_per_batch=config.frames_per_batch,
-        total_frames=-1,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
+    collector = make_collector(config, env, agent)
     begin_episodes(config, collector, log.frames)
     with tqdm(total=config.frames, unit="frame", unit_scale=True, disable=not progress) as bar:
         bar.update(log.frames)

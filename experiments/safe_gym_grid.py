@@ -109,13 +109,13 @@ def train_omnisafe(job: Run) -> dict[str, Any]:
 
     def remember(data: Mapping[str, Any] | None = None, /, **kwargs: Any) -> None:
         if data and "Metrics/EpRet" in data:
+            before, steps = episodes[-1]["frames"] if episodes else 0, float(data["Metrics/EpLen"])
             episodes.append(
                 {
-                    "frames": sum(episode["steps"] for episode in episodes)
-                    + float(data["Metrics/EpLen"]),
+                    "frames": before + steps,
                     "return": float(data["Metrics/EpRet"]),
                     "cost": float(data["Metrics/EpCost"]),
-                    "steps": float(data["Metrics/EpLen"]),
+                    "steps": steps,
                 }
             )
         store(data, **kwargs)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch
-from test_resume import SETTINGS, assert_same_run, interrupt_when
+from test_resume import SETTINGS, assert_goes_on_bit_for_bit
 from test_train import make_training
 
 from experiments import compiling
@@ -58,14 +58,4 @@ def test_trains_compiled(algorithm, tmp_path, always):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile wants a C++ compiler")
 def test_a_compiled_run_goes_on_bit_for_bit(tmp_path, always):
-    algorithm = "ppo-lagrangian"
-    settings = {**SETTINGS, "frames": 320}
-    one, two = tmp_path / "one", tmp_path / "two"
-    expected = train(Config(**settings, out=one), algorithm, progress=False)
-    folder = two / algorithm / "checkpoints"
-    thread = interrupt_when(lambda: len(list(folder.glob("*.torchrl"))) > 1)
-    with pytest.raises(KeyboardInterrupt):
-        train(Config(**settings, out=two), algorithm, progress=False)
-    thread.join()
-    resumed = train(Config(**settings, out=two, resume=True), algorithm, progress=False)
-    assert_same_run(expected, resumed, one, two)
+    assert_goes_on_bit_for_bit("ppo-lagrangian", tmp_path)

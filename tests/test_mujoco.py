@@ -1,13 +1,12 @@
 """What MuJoCo's worlds are of their own: rows of numbers that can be written, saved and shared."""
 
 import os
-import subprocess
-import sys
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+from programs import run_code
 from tensordict import TensorDict
 from worlds import ARMS, Places, each_arm, rest, step
 
@@ -354,7 +353,7 @@ def test_a_missing_mujoco_is_told_when_a_world_is_made():
         "from torchrl_safe.envs import PANDA, Scene\n"
         "MuJoCo().build(PANDA, Scene(), num_envs=1)"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    result = run_code(code)
     assert 'pip install "torchrl-safe[mujoco]"' in result.stderr.splitlines()[-1]
 
 

@@ -78,6 +78,8 @@ class World:
         # PyBullet reuses client numbers: each is disconnected once, by its owner.
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
         self._scene, self._options = scene, options
+        # Where joints and fingers are, if nothing has moved since that was last read.
+        self._positions: Vector | None = None
         try:
             self._build(arm, shapes, objects, sensing, visuals=visuals or gui)
         except BaseException:
@@ -444,9 +446,6 @@ class World:
 
     def _joint_states(self) -> tuple[tuple[float, float], ...]:
         return pybullet.getJointStates(self._arm.body, self._driven, physicsClientId=self._client)
-
-    # Where joints and fingers are, if nothing has moved since that was last read.
-    _positions: Vector | None = None
 
     def _set_joints(self, positions: Vector) -> None:
         self._positions = None

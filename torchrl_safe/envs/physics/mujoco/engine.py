@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 try:
@@ -21,19 +23,16 @@ except (ImportError, AttributeError) as _error:
 
     mujoco = batch = _Missing()
 
-__all__ = ["QUIET", "batch", "mujoco"]
+__all__ = ["batch", "mujoco", "quiet"]
 
 
-class _Quiet:
+@contextmanager
+def quiet() -> Iterator[None]:
     """Keeps MuJoCo from writing a file of what goes wrong, which is raised as an error."""
-
-    def __enter__(self) -> None:
-        self._before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-        silent.logto_file = silent.logto_console = False
-        silent.set()
-
-    def __exit__(self, *_: object) -> None:
-        self._before.set()
-
-
-QUIET = _Quiet()
+    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    silent.logto_file = silent.logto_console = False
+    silent.set()
+    try:
+        yield
+    finally:
+        before.set()

@@ -14,7 +14,7 @@ from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.bodies import obstacle, thing
 from torchrl_safe.envs.physics.mujoco.chain import Chain, ToolPose
 from torchrl_safe.envs.physics.mujoco.clearance import Clearance
-from torchrl_safe.envs.physics.mujoco.engine import QUIET, batch, mujoco
+from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
 from torchrl_safe.envs.physics.mujoco.free import TO_MUJOCO, FreeBodies
 from torchrl_safe.envs.physics.mujoco.model import build_scenery, build_world
 from torchrl_safe.envs.physics.mujoco.motors import FINGER_GROUP, fill_controls
@@ -125,7 +125,7 @@ class MuJoCoSimulator:
     def _measure_now(self, row: int) -> None:
         """Fills the trace of a world with what is measured at the beginning of an episode."""
         if self._looks:
-            with QUIET:
+            with quiet():
                 self._batch.forward([row], stage=mujoco.mjtStage.mjSTAGE_VEL)
         rows = slice(row, row + 1)
         ways = Ways(*(part[rows, None] for part in self._obstacles()))
@@ -164,7 +164,7 @@ class MuJoCoSimulator:
                 axis=2,
             )
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
-        with QUIET:
+        with quiet():
             self._record = self._batch.rollout(
                 self._frame_skip,
                 controls,
@@ -225,7 +225,7 @@ class MuJoCoSimulator:
             return
         if self._looks:
             # What MuJoCo records of a substep is how everything was before it.
-            with QUIET:
+            with quiet():
                 self._batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
             after = np.concatenate([record[:, 1:], self._readings[:, None]], axis=1)
         else:
