@@ -30,7 +30,7 @@ AlgorithmName = Literal[
     "td3-lagrangian",
 ]
 Engine = Literal["bullet", "mujoco"]
-MultiplierRule = Literal["dual-ascent", "pid", "relative-pid", "fixed"]
+MultiplierRule = Literal["pid", "dual-ascent", "fixed"]
 #: The algorithms that learn from replay; they need bounded actions.
 OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
 
@@ -95,14 +95,13 @@ class Config:
     """The same at the end; it moves from one to the other linearly."""
     gamma: float = 0.97
     """Discount of reward and cost."""
-    multiplier_rule: MultiplierRule = "dual-ascent"
-    """What moves the multiplier: the violations added up, also the last one and its rise, these
-    without a unit (it needs no multiplier_rate), or nothing."""
+    multiplier_rule: MultiplierRule = "pid"
+    """What moves the multiplier: the violations added up and the last one (pid), those added up
+    alone, or nothing."""
     multiplier_init: float = 0.0
     """Multiplier to start with."""
-    multiplier_rate: float = 0.4
-    """Step size of the multiplier, once a batch, in units of the episode cost's standard
-    deviation; the integral gain of pid, whose other two gains are five times as large."""
+    multiplier_rate: float = 0.1
+    """What a batch far above its limit adds to the multiplier."""
     pessimism: float = 2.0
     """Standard errors added to the mean cost of a batch before it is compared with the limit; p3o,
     ipo and crpo do without."""

@@ -31,6 +31,7 @@ LIMIT = ConstrainedBandit.optimal_probability
 
 # A_r - lambda A_c vanishes here at p = LIMIT.
 MULTIPLIER = 1 / math.sqrt(LIMIT * (1 - LIMIT))
+IN_UNITS = {"normalize_cost_advantage": False}
 SHARPNESS = 5.0
 
 pid = partial(PIDControl, kp=5.0, ki=1.0, kd=5.0, smoothing=0.5)
@@ -68,11 +69,11 @@ def violation(loss):
 
 NO_BONUS = {"entropy_bonus": False}
 LAGRANGIAN = {
-    "a2c": wrapping(LagrangianLoss, partial(A2CLoss, **NO_BONUS)),
-    "reinforce": wrapping(LagrangianLoss, ReinforceLoss),
-    "clip-ppo": wrapping(LagrangianLoss, partial(ClipPPOLoss, **NO_BONUS)),
-    "kl-ppo": wrapping(LagrangianLoss, partial(KLPENPPOLoss, **NO_BONUS)),
-    "focops": of_one_step(FOCOPSLoss),
+    "a2c": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(A2CLoss, **NO_BONUS)),
+    "reinforce": wrapping(partial(LagrangianLoss, **IN_UNITS), ReinforceLoss),
+    "clip-ppo": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(ClipPPOLoss, **NO_BONUS)),
+    "kl-ppo": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(KLPENPPOLoss, **NO_BONUS)),
+    "focops": of_one_step(FOCOPSLoss, **IN_UNITS),
 }
 CRPO = {
     "a2c": wrapping(CRPOLoss, partial(A2CLoss, **NO_BONUS)),
@@ -159,7 +160,7 @@ def test_the_optimum_is_the_same_for_ppo_lagrangian_to_the_bit():
     wrapped = LAGRANGIAN["clip-ppo"]
     outcomes = [
         train_on_bandit(make, partial(DualAscent, lr=1.0), num_batches=10)
-        for make in (wrapped, partial(PPOLagrangianLoss, **NO_BONUS))
+        for make in (wrapped, partial(PPOLagrangianLoss, **NO_BONUS, **IN_UNITS))
     ]
     for ours, theirs in zip(*outcomes, strict=True):
         assert torch.equal(ours, theirs)
