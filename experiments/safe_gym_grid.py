@@ -142,7 +142,8 @@ def jobs(config: Config) -> dict[Path, tuple[Run]]:
 def table(runs: list[dict[str, Any]], config: Config) -> str:
     """Returns a Markdown table with a row for each environment and library."""
     lines = [
-        f"| environment | PPO-Lagrangian | return | cost (limit {config.cost_limit:g}) | CPU minutes |",
+        f"| environment | PPO-Lagrangian | return | cost (limit {config.cost_limit:g}) "
+        "| CPU minutes |",
         "|---" * 5 + "|",
     ]
     for env, library in product(config.envs, config.libraries):
