@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from pathlib import Path
 from time import strftime
 from typing import Literal
@@ -62,6 +63,9 @@ class Config:
     workers: int | None = None
     """Processes that simulate; with 1 this process does. By default 2 with bullet, and 1 with
     mujoco, which has threads instead. Another number gives other episodes."""
+    jobs: int | None = None
+    """Algorithms that train side by side, each in a process. By default 1 with bullet, whose
+    simulation takes all cores, and one for each core with mujoco."""
     seed: int = 0
     """Seed of networks, environments and minibatches."""
     out: Path = dataclasses.field(
@@ -107,8 +111,8 @@ class Config:
     ipo and crpo do without."""
 
     def __post_init__(self) -> None:
-        counts = ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs")
-        for name in (*counts, "minibatch", "checkpoint_every", "episode_steps"):
+        counts = ("frames", "envs", "workers", "jobs", "eval_episodes", "frames_per_batch")
+        for name in (*counts, "epochs", "minibatch", "checkpoint_every", "episode_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}.")
@@ -152,3 +156,10 @@ class Config:
         if self.workers is not None:
             return self.workers
         return 2 if self.physics == "bullet" else 1
+
+    @property
+    def side_by_side(self) -> int:
+        """Algorithms that train at a time: what ``jobs`` says, or what is fastest."""
+        if self.jobs is not None:
+            return self.jobs
+        return 1 if self.physics == "bullet" else os.cpu_count() or 1
