@@ -104,7 +104,7 @@ class Config:
     alone, or nothing."""
     multiplier_init: float = 0.0
     """Multiplier to start with."""
-    multiplier_rate: float = 0.1
+    multiplier_rate: float = 0.2
     """What a batch far above its limit adds to the multiplier."""
     pessimism: float = 2.0
     """Standard errors added to the mean cost of a batch before it is compared with the limit; p3o,

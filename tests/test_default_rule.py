@@ -38,11 +38,11 @@ def test_pessimism_adds_standard_errors():
 
 @pytest.mark.parametrize("limit", [0.025, 25.0, 25_000.0])
 def test_a_limit_that_is_far_away_is_answered_within_twenty_batches(limit):
-    """From nothing to a weight of the costs of three quarters, and back at the same pace."""
+    """From nothing to a weight of the costs of five sixths, and back at the same pace."""
     updater = make_updater(cost_limit=limit)
     for _ in range(20):
         step(updater, 50 * limit, 50 * limit)
-    assert multiplier(updater).item() == pytest.approx(3.0)
+    assert multiplier(updater).item() == pytest.approx(5.0)
     for _ in range(20):
         step(updater, 0.0, 0.0)
     assert multiplier(updater).item() == 0

@@ -34,7 +34,16 @@ MULTIPLIER = 1 / math.sqrt(LIMIT * (1 - LIMIT))
 IN_UNITS = {"normalize_cost_advantage": False}
 SHARPNESS = 5.0
 
-pid = partial(PIDControl, kp=5.0, ki=1.0, kd=5.0, smoothing=0.5)
+pid = partial(
+    PIDControl,
+    kp=5.0,
+    ki=1.0,
+    kd=5.0,
+    smoothing=0.5,
+    max_multiplier=None,
+    pessimism=0.0,
+    normalize=False,
+)
 
 
 def wrapping(make, parent):
@@ -100,7 +109,9 @@ def test_lagrangian_losses_reach_the_optimum_and_its_multipliers(make):
 
 def test_cup_reaches_the_optimum():
     make = of_one_step(CUPLoss, multiplier_init=1.0)
-    rule = partial(PIDControl, kp=5.0, ki=0.5, kd=0.0)
+    rule = partial(
+        PIDControl, kp=5.0, ki=0.5, kd=0.0, max_multiplier=None, pessimism=0.0, normalize=False
+    )
     outcome = train_on_bandit(make, rule, num_batches=50, learn=learn_in_two_phases)
     share, multiplier = last(outcome, 30)
     assert share.item() == pytest.approx(LIMIT, abs=0.01)

@@ -299,7 +299,7 @@ def check_reaches_optimum(
         >>> from torchrl_safe.objectives import PIDControl, PPOLagrangianLoss
         >>> check_reaches_optimum(
         ...     partial(PPOLagrangianLoss, entropy_bonus=False),
-        ...     partial(PIDControl, kp=5.0, ki=1.0, kd=5.0, smoothing=0.5),
+        ...     partial(PIDControl, pessimism=0.0),
         ... )
     """
     shares, multipliers = train_on_bandit(

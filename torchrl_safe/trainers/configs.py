@@ -147,7 +147,7 @@ class PIDControlConfig(UpdaterConfig):
     """Configuration of :class:`~torchrl_safe.objectives.PIDControl`."""
 
     kp: float = 1.0
-    ki: float = 0.1
+    ki: float = 0.2
     kd: float = 0.0
     smoothing: float = 0.0
     max_multiplier: float | None = 10.0

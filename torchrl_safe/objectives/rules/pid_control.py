@@ -27,7 +27,7 @@ class PIDControl(MultiplierUpdater):
             + k_d (\bar J - \bar J_\mathrm{previous})_+,\ 0,\ \mathrm{max})
 
     **The defaults have no unit.** A limit that is far away is approached at the same pace whether
-    costs are thousands or thousandths: the multiplier is 1.1 after the first batch and 3 after
+    costs are thousands or thousandths: the multiplier is 1.2 after the first batch and 5 after
     twenty. It is bounded, since one that has grown while the task was not learnt yet would leave
     the reward no weight to learn it. This needs advantages without a unit, which the losses have by
     default (``normalize_cost_advantage``). With ``normalize=False`` the gains are in multiplier per
@@ -56,7 +56,7 @@ class PIDControl(MultiplierUpdater):
     Keyword Args:
         cost_limit (float, Tensor or Mapping): see :class:`MultiplierUpdater`.
         kp (float, optional): proportional gain. Defaults to ``1.0``.
-        ki (float, optional): integral gain, for each batch. Defaults to ``0.1``.
+        ki (float, optional): integral gain, for each batch. Defaults to ``0.2``.
         kd (float, optional): derivative gain, for what the violation rose since the last batch.
             Defaults to ``0.0``.
         smoothing (float, optional): weight of the past in the moving average of the cost, from 0
@@ -80,8 +80,8 @@ class PIDControl(MultiplierUpdater):
         >>> limit = torch.tensor([25.0])
         >>> updater = PIDControl(loss, cost_limit=limit, pessimism=0.0)
         >>> updater.step(torch.tensor([[26.0], [28.0]]))  # 2 above; a fifth of 25 is 5
-        >>> loss.lagrange_multiplier  # 0.1 * 2 / 5 + 1.0 * 2 / 5
-        tensor([0.4400])
+        >>> loss.lagrange_multiplier  # 0.2 * 2 / 5 + 1.0 * 2 / 5
+        tensor([0.4800])
 
         As published, in the unit of the cost:
 
@@ -103,7 +103,7 @@ class PIDControl(MultiplierUpdater):
         *,
         cost_limit: float | Tensor | Mapping[str, float],
         kp: float = 1.0,
-        ki: float = 0.1,
+        ki: float = 0.2,
         kd: float = 0.0,
         smoothing: float = 0.0,
         max_multiplier: float | None = 10.0,
