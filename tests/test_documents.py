@@ -62,7 +62,7 @@ def test_readme_loop(tmp_path):
     for batch, (cost, shown) in enumerate(lines, start=1):
         # What is printed is the rule at work, above a limit of 0.5.
         assert float(cost) > 0.5
-        assert 0 < float(shown) <= 1 + 0.2 * batch
+        assert 0 < float(shown) < 1.01 + 0.2 * batch
     script.write_text(f"import torch\n{use}print(action.shape)\n{DRIVE}", encoding="utf-8")
     *moved, shape = run(script, tmp_path).splitlines()[-6:]
     assert shape == "(3,)"
@@ -173,7 +173,7 @@ def test_trainers(tmp_path):
     step, cost = log.read_text().split(",")
     assert int(step) == 1280
     assert float(cost) > 0.5
-    assert 0 < float(shown[0]) <= 1.2
+    assert 0 < float(shown[0]) < 1.21
     assert (tmp_path / "runs" / "checkpoint").exists()
 
 

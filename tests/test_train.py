@@ -115,7 +115,7 @@ def test_help_names_the_options(capsys):
 
 
 def test_multiplier_rules():
-    """A violation beyond a fifth of the limit counts as 1: the rate, and for PID the gain of 1 more."""
+    """A violation beyond a fifth of the limit counts as 1: the rate, and the gain of PID."""
     multiplier = {}
     for name, rule in MULTIPLIER_RULES.items():
         loss = make_training().loss
