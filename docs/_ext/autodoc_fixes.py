@@ -1,0 +1,66 @@
+"""True signatures and descriptions, where autodoc by itself shows others."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.ext.autodoc.preserve_defaults import update_defvalue
+from sphinx.pycode import ModuleAnalyzer
+from sphinx.util.inspect import signature, stringify_signature
+
+
+def constructor(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, args: str | None, returns: str | None
+) -> tuple[str, None] | None:
+    """The signature of ``__init__``, where a metaclass hides it.
+
+    TorchRL makes environments and losses with metaclasses that have a ``__call__`` of their own,
+    and autodoc shows the signature of that: ``(*args, **kwargs)``.
+    """
+    if not isinstance(obj, type) or type(obj).__call__ is type.__call__:
+        return None
+    # As it is written: `physics=Bullet()`, not what it evaluates to.
+    update_defvalue(app, obj.__init__, bound_method=True)
+    shown = signature(obj.__init__, bound_method=True)
+    return stringify_signature(shown, show_annotation=False), None
+
+
+def comment(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """The ``#:`` comment of a constant that another module makes public."""
+    attribute = name.rpartition(".")[2]
+    if what != "data":
+        return
+    for module in [name for name in sys.modules if name.startswith("torchrl_safe.")]:
+        if vars(sys.modules[module]).get(attribute) is not obj:
+            continue
+        found = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", attribute))
+        if found:
+            lines[:] = found
+
+
+# Napoleon reads the text before a colon in a property's first line as its type. Here it never is.
+_DESCRIPTIONS: dict[str, list[str]] = {}
+_PROPERTIES = {"property", "attribute", "data"}
+
+
+def keep(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    if what in _PROPERTIES:
+        _DESCRIPTIONS[name] = list(lines)
+
+
+def restore(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    if what in _PROPERTIES:
+        kept = _DESCRIPTIONS.pop(name)
+        if any(line.startswith(":type:") for line in lines):
+            lines[:] = kept
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.setup_extension("sphinx.ext.autodoc")
+    app.connect("autodoc-process-signature", constructor)
+    app.connect("autodoc-process-docstring", comment, priority=300)
+    app.connect("autodoc-process-docstring", keep, priority=400)  # Before Napoleon,
+    app.connect("autodoc-process-docstring", restore, priority=600)  # and after.
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
