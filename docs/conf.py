@@ -7,11 +7,12 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "torchrl-safe"
+copyright = "2026, the torchrl-safe authors"
 version = release = installed("torchrl-safe")
 html_theme = "furo"
 html_title = "torchrl-safe"
 html_static_path = ["_static"]
-html_css_files = ["wide.css"]
+html_css_files = ["site.css"]
 
 extensions = [
     "myst_parser",
@@ -41,5 +42,6 @@ sphinx_gallery_conf = {
     "plot_gallery": False,
     "show_memory": False,
     "download_all_examples": False,
+    "write_computation_times": False,  # Their page loads scripts from elsewhere.
 }
 exclude_patterns = ["_build", "_ext"]

@@ -46,11 +46,13 @@ _PROPERTIES = {"property", "attribute", "data"}
 
 
 def keep(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Remembers how a description reads."""
     if what in _PROPERTIES:
         _DESCRIPTIONS[name] = list(lines)
 
 
 def restore(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Undoes what Napoleon took for a type."""
     if what in _PROPERTIES:
         kept = _DESCRIPTIONS.pop(name)
         if any(line.startswith(":type:") for line in lines):
@@ -58,6 +60,7 @@ def restore(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Connects the corrections, those of properties around Napoleon."""
     app.setup_extension("sphinx.ext.autodoc")
     app.connect("autodoc-process-signature", constructor)
     app.connect("autodoc-process-docstring", comment, priority=300)

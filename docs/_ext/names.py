@@ -81,5 +81,6 @@ class LinkNames(SphinxTransform):
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Adds the links to every page."""
     app.add_transform(LinkNames)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
