@@ -22,6 +22,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     # In _ext.
     "autodoc_fixes",
+    "links",
     "mathml",
     "names",
 ]
