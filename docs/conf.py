@@ -45,4 +45,4 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "write_computation_times": False,  # Their page loads scripts from elsewhere.
 }
-exclude_patterns = ["_build", "_ext"]
+exclude_patterns = ["_build", "_ext", "**sg_execution_times.rst"]

@@ -9,22 +9,30 @@ from sphinx.application import Sphinx
 from sphinx.ext.autodoc.preserve_defaults import update_defvalue
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.inspect import signature, stringify_signature
+from sphinx.util.logging import getLogger
+
+LOGGER = getLogger(__name__)
+UNKNOWN = "(*args, **kwargs)"
 
 
 def constructor(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, args: str | None, returns: str | None
 ) -> tuple[str, None] | None:
-    """The signature of ``__init__``, where a metaclass hides it.
+    """The signature of ``__init__``, where TorchRL hides it.
 
-    TorchRL makes environments and losses with metaclasses that have a ``__call__`` of their own,
-    and autodoc shows the signature of that: ``(*args, **kwargs)``.
+    TorchRL makes environments with a metaclass that has a ``__call__`` of its own, and losses with
+    a ``__new__``. Autodoc shows the signature of these: ``(*args, **kwargs)``.
     """
-    if not isinstance(obj, type) or type(obj).__call__ is type.__call__:
+    if not isinstance(obj, type) or args != UNKNOWN:
         return None
+    if getattr(obj, "_is_protocol", False):
+        return "", None
     # As it is written: `physics=Bullet()`, not what it evaluates to.
     update_defvalue(app, obj.__init__, bound_method=True)
-    shown = signature(obj.__init__, bound_method=True)
-    return stringify_signature(shown, show_annotation=False), None
+    shown = stringify_signature(signature(obj.__init__, bound_method=True), show_annotation=False)
+    if shown == UNKNOWN:
+        LOGGER.warning("%s has no signature", name)
+    return shown, None
 
 
 def comment(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
