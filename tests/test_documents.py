@@ -108,6 +108,19 @@ def test_quickstart(tmp_path):
     assert len({line for line in moved if line.startswith("moved by 0.")}) == 5
 
 
+def test_several_limits(tmp_path):
+    (code,) = code_of("docs/howto/several_limits.md")
+    short = code.replace("total_frames=256_000", "total_frames=2_048")
+    short = short.replace("range(10)", "range(1)")
+    assert short.count("2_048") == short.count("range(1)") == 1
+    script = tmp_path / "limits.py"
+    check = "print(episode_cost.shape[-1], *(m > 0 for m in loss.lagrange_multiplier.tolist()))\n"
+    script.write_text(short + check, encoding="utf-8")
+    # Random actions are too fast, and that alone is certain.
+    assert re.fullmatch("2 (True|False) True", run(script, tmp_path).splitlines()[-1])
+    assert list(tmp_path.glob("runs/two-limits/events*"))
+
+
 def test_an_arm_of_ones_own(tmp_path):
     script = tmp_path / "arm.py"
     script.write_text("\n".join(code_of("docs/howto/arm.md")), encoding="utf-8")
@@ -143,12 +156,20 @@ def test_deploying_a_policy(tmp_path):
     """What docs/howto/deploy.md does with a file, on few episodes."""
     actor = TensorDictModule(MLP(40, 3), ["observation"], ["action"])
     save_policy(tmp_path / "policy.pt", actor, Composite(observation=Unbounded(40)))
-    load, measure = code_of("docs/howto/deploy.md")
+    load, drive, measure = code_of("docs/howto/deploy.md")
     short = measure.replace("num_envs=32", "num_envs=2").replace("256", "2")
     assert short != measure
     show = "print(action.shape, len(figures))\n"
-    (tmp_path / "deploy.py").write_text(load + short + show, encoding="utf-8")
-    assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-1] == "(3,) 5"
+    arm = """
+sent, began = [], __import__("time").perf_counter()
+def read_observation(): return np.zeros(40)
+def send_action(action): sent.append(action)
+def is_running(): return len(sent) < 4
+"""
+    pace = "print(len(sent), 0.15 <= time.perf_counter() - began)\n"
+    code = load + arm + drive + pace + short + show
+    (tmp_path / "deploy.py").write_text(code, encoding="utf-8")
+    assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-2:] == ["4 True", "(3,) 5"]
 
 
 def test_environments(tmp_path):
