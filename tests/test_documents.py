@@ -49,9 +49,16 @@ print(action.shape)
 def test_readme_loop(tmp_path):
     loop, use = code_of("README.md")[:2]
     assert len(loop.splitlines()) <= 40
-    # The same program on fewer frames.
-    short = loop.replace("total_frames=256_000", "total_frames=4_096")
-    assert short != loop
+    # The same program, on a quarter of the worlds and two batches.
+    short = loop
+    for told, smaller in (
+        ("num_envs=32", "num_envs=8"),
+        ("total_frames=256_000", "total_frames=1_024"),
+        ("frames_per_batch=2048", "frames_per_batch=512"),
+        ("LazyTensorStorage(2048)", "LazyTensorStorage(512)"),
+    ):
+        assert short.count(told) == 1
+        short = short.replace(told, smaller)
     script = tmp_path / "readme.py"
     script.write_text(short, encoding="utf-8")
     lines = re.findall(
@@ -195,5 +202,11 @@ def test_testing(tmp_path):
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda p: p.stem)
-def test_tutorial(path):
-    assert run(path)
+def test_tutorial(path, tmp_path):
+    """Two of its batches."""
+    text = path.read_text(encoding="utf-8")
+    short = text.replace("TOTAL_FRAMES = 4_096", "TOTAL_FRAMES = 2_048")
+    assert short != text
+    script = tmp_path / path.name
+    script.write_text(short, encoding="utf-8")
+    assert run(script, tmp_path)

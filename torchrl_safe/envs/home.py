@@ -71,7 +71,7 @@ def find_home(
     simulator = physics.build(arm, Scene(), num_envs=1)
     try:
         found, free = (
-            _search(simulator, arm.home, point, turned, respect_limits=limits)
+            _search(simulator, arm.home, (point, turned), respect_limits=limits)
             for limits in (True, False)
         )
         for end in (found, free):
@@ -88,11 +88,11 @@ def find_home(
 
 
 def _search(
-    simulator: Simulator, home: Sequence[float], point: Array, turned: Array, *, respect_limits: bool
+    simulator: Simulator, home: Sequence[float], pose: tuple[Array, Array], *, respect_limits: bool
 ) -> Approach:
-    """The way of one arm: its parts without their first axis."""
-    start, goal, turn = (np.array(part, dtype=float)[None] for part in (home, point, turned))
-    found = approach(simulator, start, goal, turn, respect_limits=respect_limits)
+    """One search alone: its parts without their first axis."""
+    start, point, turned = (np.array(part, dtype=float)[None] for part in (home, *pose))
+    found = approach(simulator, start, point, turned, respect_limits=respect_limits)
     return Approach(*(part[0] for part in found))
 
 
