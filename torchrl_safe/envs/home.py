@@ -97,7 +97,7 @@ def _search(
 
 
 def _has_arrived(found: Approach) -> bool:
-    return max(found.distance, found.turn) < _ARRIVED
+    return bool(max(found.distance, found.turn) < _ARRIVED)
 
 
 def _what_stopped(
