@@ -392,7 +392,7 @@ def test_ensemble_members_differ_and_can_be_given(kind):
 RULES = {
     "dual-ascent": lambda loss: DualAscent(loss, cost_limit=torch.tensor([1.0, 5.0]), lr=0.5),
     "pid": lambda loss: PIDControl(
-        loss, cost_limit=torch.tensor([1.0, 5.0]), kp=0.0, ki=0.5, kd=0.0
+        loss, cost_limit=torch.tensor([1.0, 5.0]), kp=0.0, ki=0.5, normalize=False, pessimism=0.0
     ),
 }
 

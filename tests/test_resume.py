@@ -179,12 +179,12 @@ def results(out):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-def test_stopped_again_and_again(tmp_path, workers, start):
+@pytest.mark.parametrize(("workers", "jobs"), [(1, 1), (2, 1), (1, 2)])
+def test_stopped_again_and_again(tmp_path, workers, jobs, start):
     """By all signals, in training and after it; what was finished stays, the rest is the same."""
     one, two = tmp_path / "one", tmp_path / "two"
     names = ("ppo", "sac-lagrangian")
-    process = start(one, *names, workers=workers)
+    process = start(one, *names, workers=workers, jobs=1)
     _, problem = process.communicate()
     assert process.returncode == 0, problem
 
@@ -200,14 +200,14 @@ def test_stopped_again_and_again(tmp_path, workers, start):
         (signal.SIGINT, reaches("sac-lagrangian", 256)),
     )
     for number, happens in stops:
-        process = start(two, *names, workers=workers)
+        process = start(two, *names, workers=workers, jobs=jobs)
         wait_for(process, happens)
         children = children_of(process.pid)
         process.send_signal(number)
         process.communicate()
         assert process.returncode != 0
         wait_until_gone(children)
-    process = start(two, *names, workers=workers)
+    process = start(two, *names, workers=workers, jobs=jobs)
     _, problem = process.communicate()
     assert process.returncode == 0, problem
     assert results(one) == results(two)
