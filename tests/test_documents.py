@@ -49,16 +49,9 @@ print(action.shape)
 def test_readme_loop(tmp_path):
     loop, use = code_of("README.md")[:2]
     assert len(loop.splitlines()) <= 40
-    # The same program, on a quarter of the worlds and two batches.
-    short = loop
-    for told, smaller in (
-        ("num_envs=32", "num_envs=8"),
-        ("total_frames=256_000", "total_frames=1_024"),
-        ("frames_per_batch=2048", "frames_per_batch=512"),
-        ("LazyTensorStorage(2048)", "LazyTensorStorage(512)"),
-    ):
-        assert short.count(told) == 1
-        short = short.replace(told, smaller)
+    # The same program on fewer frames.
+    short = loop.replace("total_frames=256_000", "total_frames=4_096")
+    assert short != loop
     script = tmp_path / "readme.py"
     script.write_text(short, encoding="utf-8")
     lines = re.findall(
