@@ -40,8 +40,8 @@ def side_by_side(
     """
     context = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
-    prepared = {"initializer": _prepare, "initargs": (context.RLock(),)}
-    with ProcessPoolExecutor(workers, context, **prepared) as pool:
+    lock = context.RLock()
+    with ProcessPoolExecutor(workers, context, initializer=_prepare, initargs=(lock,)) as pool:
         try:
             running = {pool.submit(run, *each): index for index, each in enumerate(arguments)}
             for done in as_completed(running):

@@ -51,9 +51,13 @@ RULES = {
 }
 
 
+# Dual ascent circles for longer.
+BATCHES = {"dual-ascent": 240, "pid": 120}
+
+
 @pytest.fixture(scope="module")
 def trained():
-    return {name: train_ppo(rule, num_batches=240) for name, rule in RULES.items()}
+    return {name: train_ppo(rule, num_batches=BATCHES[name]) for name, rule in RULES.items()}
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -61,7 +65,8 @@ def test_policy_and_multipliers_reach_the_optimum(trained, rule):
     shares, multipliers = trained[rule]
     # Ascent on the multiplier and descent on the policy circle inwards, so the means of the last
     # third are compared; over ten seeds they stayed within half of these tolerances.
-    share, multiplier = shares[-80:].mean(), multipliers[-80:].mean(0)
+    last = BATCHES[rule] // 3
+    share, multiplier = shares[-last:].mean(), multipliers[-last:].mean(0)
     assert share.item() == pytest.approx(LIMIT, abs=0.02)
     assert multiplier[0].item() == pytest.approx(1 / math.sqrt(LIMIT * (1 - LIMIT)), abs=0.1)
     assert multiplier[1].item() == pytest.approx(0.0, abs=1e-3)
@@ -72,12 +77,12 @@ def test_pid_control_damps_the_circling(trained):
 
     Means (and standard deviations) over ten seeds, dual ascent and PID control: swing below the
     limit 0.235 (0.014) and 0.093 (0.039), and above it again 0.280 (0.038) and 0.064 (0.007);
-    excess summed over all batches 12.5 (2.3) and 5.0 (0.9). 512 episodes a batch make 0.02 of
+    excess summed over 120 batches 11.2 (1.9) and 4.0 (0.9). 512 episodes a batch make 0.02 of
     noise.
     """
     below, above, total = {}, {}, {}
     for name, (shares, _) in trained.items():
-        excess = shares - LIMIT
+        excess = shares[:120] - LIMIT
         after = excess[(excess <= 0).int().argmax() :]
         below[name], above[name], total[name] = -after.min(), after.max(), excess.relu().sum()
     for swing in (below, above, total):

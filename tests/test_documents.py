@@ -274,5 +274,11 @@ def test_testing(tmp_path):
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda p: p.stem)
-def test_tutorial(path):
-    assert run(path)
+def test_tutorial(path, tmp_path):
+    """Two of its batches."""
+    text = path.read_text(encoding="utf-8")
+    short = text.replace("TOTAL_FRAMES = 4_096", "TOTAL_FRAMES = 2_048")
+    assert short != text
+    script = tmp_path / path.name
+    script.write_text(short, encoding="utf-8")
+    assert run(script, tmp_path)

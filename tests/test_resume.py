@@ -1,5 +1,6 @@
 """A run that is stopped at any point and resumed is the run that never was, bit for bit."""
 
+import gc
 import json
 import os
 import shutil
@@ -65,21 +66,24 @@ def make_train(out, *algorithms, **settings):
     )
 
 
-def wait_for(process, happens):
+def wait_for(process, happens, every=0.001):
     deadline = time.monotonic() + 600
     while not happens():
         if process.poll() is not None:
             pytest.fail(f"ended with {process.returncode}: {process.stderr.read()[-3000:]}")
         assert time.monotonic() < deadline
-        time.sleep(0.001)
+        time.sleep(every)
 
 
 def kill_in_the_middle_of_a_write(process, folder):
     unfinished = folder / ".unfinished"
+    # Not at the first: there is nothing to go on from.
+    wait_for(process, lambda: any(folder.glob("*.torchrl")), every=0.02)
     while True:
-        # Not at the first: there is nothing to go on from.
-        wait_for(process, lambda: any(folder.glob("*.torchrl")) and unfinished.exists())
+        wait_for(process, unfinished.exists)
         process.send_signal(signal.SIGSTOP)
+        # It does not stop at once.
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
         left = list(unfinished.rglob("*.pt")) if unfinished.exists() else []
         if left:
             process.kill()
@@ -139,6 +143,11 @@ def interrupt_when(happens):
     return thread
 
 
+# An interrupt may come between open() and the "with" that closes the file: then Python closes it,
+# and warns.
+may_leave_a_file_open = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+
+
 def assert_goes_on_bit_for_bit(algorithm, tmp_path):
     """Stopped after its second checkpoint, a run ends as one that was never stopped."""
     settings = {**SETTINGS, "frames": 320}
@@ -149,10 +158,12 @@ def assert_goes_on_bit_for_bit(algorithm, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(Config(**settings, out=two), algorithm, progress=False)
     thread.join()
+    gc.collect()  # What was left open is closed now, while that may be.
     resumed = train(Config(**settings, out=two, resume=True), algorithm, progress=False)
     assert_same_run(expected, resumed, one, two)
 
 
+@may_leave_a_file_open
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_algorithm_goes_on_bit_for_bit(algorithm, tmp_path):
