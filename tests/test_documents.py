@@ -172,6 +172,12 @@ def is_running(): return len(sent) < 4
     assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-2:] == ["4 True", "(3,) 5"]
 
 
+def test_any_environment(tmp_path):
+    code = code_of("docs/safe_gym.md")[0]
+    (tmp_path / "oven.py").write_text(code, encoding="utf-8")
+    assert run(tmp_path / "oven.py").splitlines()[-1] == "torch.Size([3, 1])"
+
+
 def test_environments(tmp_path):
     """Each block runs by itself, and each environment in it is one."""
     blocks = code_of("docs/environments.md") + code_of("docs/engines.md")
