@@ -145,7 +145,9 @@ class OnPolicy:
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
-        agent = make_agent(env, gamma=config.gamma, log_std=config.first_log_std)
+        agent = make_agent(
+            env, gamma=config.gamma, hidden=config.hidden, log_std=config.first_log_std
+        )
         options = {"num_costs": num_costs(env)}
         if self.updater is move_multiplier and config.multiplier_rule == "relative-pid":
             options["normalize_cost_advantage"] = True
@@ -196,7 +198,9 @@ class OffPolicy:
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
-        agent = make_q_agent(env, gamma=config.gamma, stochastic=self.stochastic)
+        agent = make_q_agent(
+            env, gamma=config.gamma, stochastic=self.stochastic, hidden=config.hidden
+        )
         spec = env.action_spec_unbatched
         loss = self.loss(
             agent.actor,

@@ -48,7 +48,11 @@ from torchrl_safe.envs import (
     NoObstacles,
     Obstacles,
     Physics,
+    PickAndPlace,
+    Push,
+    Reach,
     Scattered,
+    Task,
     gym,
     paper_env,
     paper_observation,
@@ -56,6 +60,12 @@ from torchrl_safe.envs import (
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.policy import save_policy
 
+# The tasks, with control steps enough for an episode.
+TASKS: dict[str, tuple[Task, int]] = {
+    "reach": (Reach(), 40),
+    "push": (Push(), 100),
+    "pick-and-place": (PickAndPlace(), 100),
+}
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 OBSTACLES: dict[str, Obstacles] = {
     "none": NoObstacles(),
@@ -64,7 +74,10 @@ OBSTACLES: dict[str, Obstacles] = {
     "moving": Moving(),
     "human": Human(),
 }
-ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointDelta()}
+ACTIONS: dict[str, CartesianDelta | JointDelta] = {
+    "cartesian": CartesianDelta(),
+    "joint": JointDelta(),
+}
 PHYSICS: dict[str, Physics] = {"bullet": Bullet(), "mujoco": MuJoCo()}
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
@@ -87,6 +100,7 @@ def make_env(
     The sums, over each episode, are of what the arm has earned and cost, whatever an algorithm
     makes of it.
     """
+    task, steps = TASKS[config.task]
     settings: dict[str, Any] = {
         "observation": OBSERVATIONS[config.observation],
         "num_envs": num_envs,
@@ -98,13 +112,15 @@ def make_env(
     if config.paper:
         env = paper_env(PAPER_ACTIONS[config.action], **settings)
     else:
+        fingers = 0.04 if config.task == "pick-and-place" else None
         env = ArmEnv(
             ARMS[config.arm],
-            action=ACTIONS[config.action],
+            action=dataclasses.replace(ACTIONS[config.action], finger_step=fingers),
+            task=task,
             obstacles=OBSTACLES[config.obstacles],
             costs=COSTS,
             physics=PHYSICS[config.physics],
-            **settings,
+            **{"max_episode_steps": steps, **settings},
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = ALGORITHMS[algorithm].transforms(config)

@@ -133,10 +133,10 @@ def test_reward_of_pushing_is_progress():
     """On the way of the cube, and half as much on the tool's to the point behind it."""
     # 0.02 m of cube and 0.01 m of fingers before the cube, seen along the way of (3, 4).
     behind, goal = np.array([-0.018, -0.024, 0]), [[0.3, 0.4, 0.0]] * 2
-    before = make_state(goal=goal, ee_position=[behind + (0, 0, 0.2), behind])
+    before = make_state(goal=goal, ee_position=[np.add(behind, (0, 0, 0.2)), behind])
     after = make_state(
         goal=goal,
-        ee_position=[behind + (0, 0.1, 0), behind],
+        ee_position=[np.add(behind, (0, 0.1, 0)), behind],
         # The second is pushed to where it counts as there.
         object_position=[[[0, 0, 0]], [[0.3, 0.37, 0]]],
         previous=before,

@@ -19,6 +19,7 @@ from experiments.config import OFF_POLICY, AlgorithmName, Config
 from experiments.learners import NoiseSchedule
 from experiments.report import table
 from experiments.train import collecting, main, make_env, train
+from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -283,3 +284,21 @@ def test_noise_falls_from_batch_to_batch():
 def test_bad_settings(settings, message):
     with pytest.raises(ValueError, match=message):
         Config(**settings)
+
+
+@pytest.mark.parametrize(
+    ("task", "kind", "actions", "steps"),
+    [("reach", Reach, 3, 40), ("push", Push, 3, 100), ("pick-and-place", PickAndPlace, 4, 100)],
+)
+def test_a_task_gets_fingers_and_time(task, kind, actions, steps):
+    env = make_env(Config(task=task), num_envs=1)
+    assert isinstance(env.base_env.task, kind)
+    assert env.action_spec_unbatched.shape == (actions,)
+    assert env.base_env.max_episode_steps == steps
+    env.close()
+
+
+def test_networks_are_as_wide_as_wanted():
+    agent = make_training(hidden=48)
+    widths = {parameter.shape[0] for parameter in agent.loss.parameters() if parameter.ndim == 2}
+    assert widths == {48, 3, 1}
