@@ -36,6 +36,17 @@ class Affine(torch.nn.Module):
         return self.loc + self.scale * x
 
 
+class Standardize(Affine):
+    """The same, and no further than five deviations from the middle, as is usual.
+
+    Random actions hardly ever touch an object: of what its velocities become when it is pushed they
+    tell nothing, and a hundred deviations would drown all else that a network sees.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x).clamp(-5, 5)
+
+
 class Agent(NamedTuple):
     """A policy, critics of the state, and the logarithm of the policy's deviation in all states."""
 
@@ -75,7 +86,7 @@ def make_actor(
     """
     actions = env.action_spec.shape[-1]
     outputs = actions * (2 if noise == "chosen" else 1)
-    net = torch.nn.Sequential(Affine(loc, scale), _small_network(len(loc), hidden, outputs))
+    net = torch.nn.Sequential(Standardize(loc, scale), _small_network(len(loc), hidden, outputs))
     if noise == "none":
         policy = torch.nn.Sequential(net, torch.nn.Tanh())
         return TensorDictModule(policy, ["observation"], ["action"])
@@ -113,7 +124,7 @@ def make_agent(env: EnvBase, *, gamma: float, hidden: int = 64, log_std: float =
     def critic(outputs: int, out_key: str) -> ValueOperator:
         net = _small_network(len(loc), hidden, outputs)
         predict = torch.nn.Sequential(
-            torch.nn.Sequential(Affine(loc, scale), net), Affine(0.0, 1 / (1 - gamma))
+            torch.nn.Sequential(Standardize(loc, scale), net), Affine(0.0, 1 / (1 - gamma))
         )
         return ValueOperator(predict, in_keys=["observation"], out_keys=[out_key])
 
@@ -140,7 +151,7 @@ def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool, hidden: int = 
 
     def critic(outputs: int, out_key: str) -> ValueOperator:
         net = _small_network(len(loc) + actions, hidden, outputs)
-        predict = _OfStateAndAction(Affine(loc, scale), net, Affine(0.0, 1 / (1 - gamma)))
+        predict = _OfStateAndAction(Standardize(loc, scale), net, Affine(0.0, 1 / (1 - gamma)))
         return ValueOperator(predict, in_keys=["observation", "action"], out_keys=[out_key])
 
     costs = num_costs(env)
@@ -149,7 +160,7 @@ def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool, hidden: int = 
 
 
 class _OfStateAndAction(torch.nn.Module):
-    def __init__(self, standardize: Affine, net: MLP, unit: Affine) -> None:
+    def __init__(self, standardize: Standardize, net: MLP, unit: Affine) -> None:
         super().__init__()
         self.standardize, self.net, self.unit = standardize, net, unit
 

@@ -148,20 +148,26 @@ def test_reward_of_pushing_is_progress():
 
 
 def test_reward_of_picking_up_is_progress():
-    """Of the cube, half as much of the tool to its middle, and of the fingers around it."""
+    """Of the tool, to the cube from above, of the fingers, and of the cube once it is held."""
     goal = [[0.3, 0.4, 0.0]] * 2
-    # Closed above the cube: 0.04 m to open, 0.02 m to close again.
-    closed = make_state(
-        goal=goal, ee_position=[[0, 0, 0.1]] * 2, finger_position=[[0, 0], [0.01, 0.02]]
-    )
-    around = make_state(
-        goal=goal,
-        ee_position=[[0, 0, 0.01], [0, 0, 0.1]],
-        finger_position=[[0.03, 0.03], [0.05, 0.05]],
-        previous=closed,
-    )
-    # 0.5 + 0.05 + 0.06 to 0.5 + 0.005 + 0.01; and the fingers alone, 0.045 to 0.02.
-    np.testing.assert_allclose(PickAndPlace().reward(around), [0.095 / 0.05, 0.025 / 0.05])
+
+    def state(places, openings, **settings):
+        fingers = [[opening, opening] for opening in openings]
+        return make_state(goal=goal, ee_position=places, finger_position=fingers, **settings)
+
+    # Closed above the cube: 0.1 m to go, 0.04 m to open, 0.02 m to close again. And as far beside
+    # it as it is high: 0.05 m, and 0.01 m too low where it has to be 0.04 m high.
+    closed = state([[0, 0, 0.1], [0.04, 0, 0.03]], [0, 0.01])
+    # Around it, with 0.01 m to close. And as far beside it in the air, open for whatever size.
+    around = state([[0, 0, 0.01], [0, 0.04, 0.2]], [0.03, 0.1], previous=closed)
+    held = state([[0, 0, 0.01], [0, 0.04, 0.2]], [0.022, 0.1], previous=around)
+    expected = [
+        (around, [0.1 + 0.18 - 0.01 - 0.03, 0.05 + 0.01 + 0.15 - np.hypot(0.04, 0.2) - 0.06]),
+        # From 1 m for what is not held to the 0.5 m that it is away.
+        (held, [1 - 0.5 + 3 * 0.008, 0]),
+    ]
+    for after, progress in expected:
+        np.testing.assert_allclose(PickAndPlace().reward(after) * 0.05, progress, atol=1e-12)
 
 
 @pytest.mark.parametrize(("kind", "width"), [(Push, 3), (PickAndPlace, 4)])

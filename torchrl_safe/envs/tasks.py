@@ -16,8 +16,11 @@ from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.state import ArmState, Array
 
 _ATTEMPTS, _PAIRS = 30, 64
-# Half the width of closed fingers; how much wider than an object fingers open on each side. m
-_HALF_A_TOOL, _ROOM = 0.01, 0.02
+# Half the width of closed fingers, m.
+_HALF_A_TOOL = 0.01
+# To pick up, m: how much wider than the object fingers open on each side, and how near to it they
+# hold it; how high the tool comes; and what counts as the object's way while nothing holds it.
+_ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 1.0
 
 
 @runtime_checkable
@@ -193,10 +196,14 @@ class PickAndPlace:
     The reward of a step is the progress, as in :class:`Push`, on the way
 
     .. math::
-        w = |o - g| + \tfrac12 |t - o| + f
+        w = c + |t - o| + h + 3 f
 
-    with f what the fingers still have to move: to open by 2 cm more than the object takes, and,
-    when the tool point is in the object, to close on it.
+    - c is :math:`|o - g|` while the object is held, and 1 m while it is not: to push it is no
+      progress.
+    - h is how far the tool is too low to come from above: at a horizontal distance of up to 0.06 m
+      it is to be as high above the object.
+    - f is how far the fingers still have to move: to open by 0.02 m more than the object takes and,
+      when the tool point is in the object, to close on it.
 
     Args:
         region: where the goal is drawn, uniformly, and the cube below; a goal in the air is not
@@ -262,11 +269,15 @@ class PickAndPlace:
 
     def _way(self, state: ArmState) -> Array:
         """How far it is still to go, m."""
-        to_object = np.linalg.norm(state.ee_position - state.object_position[:, 0], axis=1)
-        opening, half = state.finger_position.mean(axis=1), min(self.shape.half_extents)
-        to_open = np.maximum(0, half + _ROOM - opening)
-        fingers = np.where(to_object < half, np.abs(opening - half), to_open + _ROOM)
-        return _object_distance(state) + to_object / 2 + fingers
+        from_object = state.ee_position - state.object_position[:, 0]
+        distance, half = np.linalg.norm(from_object, axis=1), min(self.shape.half_extents)
+        beside = np.linalg.norm(from_object[:, :2], axis=1)
+        too_low = np.maximum(0, np.minimum(beside, _ABOVE) - from_object[:, 2])
+        opening = state.finger_position.mean(axis=1)
+        inside, to_close = distance < half, np.abs(opening - half)
+        fingers = np.where(inside, to_close, np.maximum(0, half + _ROOM - opening) + _ROOM)
+        held = inside & (to_close < _CLOSED)
+        return np.where(held, _object_distance(state), _FAR) + distance + too_low + 3 * fingers
 
 
 def _check(region: Region | None, radius: float) -> None:
