@@ -287,15 +287,36 @@ def test_bad_settings(settings, message):
 
 
 @pytest.mark.parametrize(
-    ("task", "kind", "actions", "steps"),
-    [("reach", Reach, 3, 40), ("push", Push, 3, 100), ("pick-and-place", PickAndPlace, 4, 100)],
+    ("task", "kind", "step", "fingers", "steps"),
+    [
+        ("reach", Reach, 0.05, 0, 40),
+        ("push", Push, 0.03, 0, 100),
+        ("pick-and-place", PickAndPlace, 0.03, 1, 100),
+    ],
 )
-def test_a_task_gets_fingers_and_time(task, kind, actions, steps):
+def test_a_task_gets_the_action_and_the_time_it_needs(task, kind, step, fingers, steps):
+    env = make_env(Config(task=task, action="joint"), num_envs=1)
+    assert env.action_spec_unbatched.shape == (7 + fingers,)
+    env.close()
     env = make_env(Config(task=task), num_envs=1)
     assert isinstance(env.base_env.task, kind)
-    assert env.action_spec_unbatched.shape == (actions,)
+    assert env.base_env.action_mode.step == step
+    assert env.action_spec_unbatched.shape == (3 + fingers,)
     assert env.base_env.max_episode_steps == steps
     env.close()
+
+
+def test_what_no_random_action_shows_drowns_nothing():
+    """A cube's speed is hardly ever seen before it is pushed."""
+    torch.manual_seed(0)
+    env = make_env(Config(task="push"), num_envs=2, seed=0)
+    standardize = make_agent(env, gamma=0.97).actor.get_submodule("0.module.0.0")
+    env.close()
+    middle = -standardize.loc / standardize.scale
+    deviations = torch.tensor([-100.0, -5.0, 3.0, 100.0])[:, None]
+    seen = standardize(middle + deviations / standardize.scale)
+    expected = torch.tensor([-5.0, -5.0, 3.0, 5.0])[:, None]
+    torch.testing.assert_close(seen, expected.expand_as(seen), rtol=0, atol=1e-4)
 
 
 def test_networks_are_as_wide_as_wanted():
