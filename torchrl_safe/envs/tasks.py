@@ -16,6 +16,8 @@ from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.state import ArmState, Array
 
 _ATTEMPTS, _PAIRS = 30, 64
+# What success is worth: about as much as all the progress before.
+_BONUS = 10.0
 # Half the width of closed fingers, m.
 _HALF_A_TOOL = 0.01
 # To pick up, m: how much wider than the object fingers open on each side, and how near to it they
@@ -109,18 +111,19 @@ class Push:
     takes longer than reaching: give the environment ``max_episode_steps=60``, or 200 where the cube
     has to go round an obstacle.
 
-    The reward of a step is the progress :math:`w - w'`, in units of ``radius``, on the way that is
-    still to go before and after it. With the object at o, the goal at g and the tool at t it is
+    The reward of a step is its progress :math:`(w - w') / \text{radius}` on the way that is still
+    to go before and after it, and 10 at success. With the object at o, the goal at g and the tool
+    at t the way is
 
     .. math::
         w = |o - g| + \tfrac12 |t - b|
 
-    where b is behind the object, seen from the goal: panda-gym's dense reward :math:`-|o - g|` does
-    not change before the first touch. Nothing is left of the way where the task is done.
-    Progress is the reward :math:`-(1 - \gamma) w'` with potential-based shaping (Ng et al. 1999),
-    :math:`\gamma \Phi(s') - \Phi(s)` with :math:`\Phi = -w`, for every discount :math:`\gamma`: the
-    policies that are best with one are best with the other, and there is less for a critic to
-    learn.
+    where b is behind the object, seen from the goal, and at its upper half: panda-gym's dense
+    reward :math:`-|o - g|` does not change before the first touch. Nothing is left of the way where
+    the task is done. Progress is potential-based shaping (Ng et al. 1999),
+    :math:`\gamma \Phi(s') - \Phi(s)` with :math:`\Phi = -w / \text{radius}`, of the reward
+    :math:`-(1 - \gamma) w' / \text{radius}`, for every discount :math:`\gamma`: the same policies
+    are best with and without it, and a critic has less to learn.
 
     Args:
         region: where the cube and its goal are drawn, uniformly; heights do not matter. ``None``
@@ -178,6 +181,7 @@ class Push:
         forward = (state.goal - place) * (1, 1, 0)
         forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
         behind = place - (max(self.shape.half_extents[:2]) + _HALF_A_TOOL) * forward
+        behind[:, 2] += self.shape.half_extents[2] / 2
         to_behind = np.linalg.norm(state.ee_position - behind, axis=1)
         return _object_distance(state) + to_behind / 2
 
@@ -193,7 +197,7 @@ class PickAndPlace:
     20 N, from which 1 kg slips whenever the arm starts to move fast. The action must move the
     fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs ``max_episode_steps=100``.
 
-    The reward of a step is the progress, as in :class:`Push`, on the way
+    The reward of a step is that of :class:`Push`, with the way
 
     .. math::
         w = c + |t - o| + h + 3 f
@@ -297,11 +301,11 @@ def _reward(distance: Array, radius: float, sparse: bool) -> Array:
 
 
 def _progress(state: ArmState, way: Callable[[ArmState], Array], radius: float) -> Array:
-    """How much shorter a way has become in a step, in radii; none is left where it is done."""
+    """How much shorter a way has become in a step, in radii, and a bonus where it is done."""
     if state.previous is None:
         return np.zeros(len(state.goal))
-    left = np.where(_object_distance(state) < radius, 0, way(state))
-    return (way(state.previous) - left) / radius
+    done = _object_distance(state) < radius
+    return (way(state.previous) - np.where(done, 0, way(state))) / radius + _BONUS * done
 
 
 def _object_distance(state: ArmState) -> Array:
