@@ -149,7 +149,7 @@ def test_reward_of_pushing_is_progress():
 
 def test_reward_of_picking_up_is_progress():
     """Of the tool, to the cube from above, of the fingers, and of the cube once it is held."""
-    goal = [[0.3, 0.4, 0.0]] * 2
+    goal = [[0.12, 0.16, 0.0]] * 2
 
     def state(places, openings, **settings):
         fingers = [[opening, opening] for opening in openings]
@@ -163,8 +163,8 @@ def test_reward_of_picking_up_is_progress():
     held = state([[0, 0, 0.01], [0, 0.04, 0.2]], [0.022, 0.1], previous=around)
     expected = [
         (around, [0.1 + 0.18 - 0.01 - 0.03, 0.05 + 0.01 + 0.15 - np.hypot(0.04, 0.2) - 0.06]),
-        # From 1 m for what is not held to the 0.5 m that it is away.
-        (held, [1 - 0.5 + 3 * 0.008, 0]),
+        # From 0.5 m for what is not held to the 0.2 m that it is away.
+        (held, [0.5 - 0.2 + 3 * 0.008, 0]),
     ]
     for after, progress in expected:
         np.testing.assert_allclose(PickAndPlace().reward(after) * 0.05, progress, atol=1e-12)

@@ -22,7 +22,7 @@ _BONUS = 10.0
 _HALF_A_TOOL = 0.01
 # To pick up, m: how much wider than the object fingers open on each side, and how near to it they
 # hold it; how high the tool comes; and what counts as the object's way while nothing holds it.
-_ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 1.0
+_ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 0.5
 
 
 @runtime_checkable
@@ -202,8 +202,8 @@ class PickAndPlace:
     .. math::
         w = c + |t - o| + h + 3 f
 
-    - c is :math:`|o - g|` while the object is held, and 1 m while it is not: to push it is no
-      progress.
+    - c is :math:`|o - g|` while the object is held, and 0.5 m (where the goal is farther: always)
+      while it is not: to push it is no progress.
     - h is how far the tool is too low to come from above: at a horizontal distance of up to 0.06 m
       it is to be as high above the object.
     - f is how far the fingers still have to move: to open by 0.02 m more than the object takes and,
@@ -281,7 +281,8 @@ class PickAndPlace:
         inside, to_close = distance < half, np.abs(opening - half)
         fingers = np.where(inside, to_close, np.maximum(0, half + _ROOM - opening) + _ROOM)
         held = inside & (to_close < _CLOSED)
-        return np.where(held, _object_distance(state), _FAR) + distance + too_low + 3 * fingers
+        carrying = np.where(held, np.minimum(_object_distance(state), _FAR), _FAR)
+        return carrying + distance + too_low + 3 * fingers
 
 
 def _check(region: Region | None, radius: float) -> None:
