@@ -130,7 +130,7 @@ def test_sparse_is_sparse_with_shaping_too(kind):
 
 
 def test_reward_of_pushing_is_progress():
-    """On the way of the cube, and half as much on the tool's to the point behind it."""
+    """On the way of the cube, and on the tool's to the point behind it."""
     # 0.02 m of cube and 0.01 m of fingers before the cube, seen along the way of (3, 4).
     behind, goal = np.array([-0.018, -0.024, 0.01]), [[0.3, 0.4, 0.0]] * 2
     before = make_state(goal=goal, ee_position=[np.add(behind, (0, 0, 0.2)), behind])
@@ -141,9 +141,9 @@ def test_reward_of_pushing_is_progress():
         object_position=[[[0, 0, 0]], [[0.3, 0.37, 0]]],
         previous=before,
     )
-    # From 0.5 + 0.2 / 2 to 0.5 + 0.1 / 2, and from 0.5 to nothing, with 10 for it.
-    np.testing.assert_allclose(Push(radius=0.05).reward(after), [1, 20])
-    np.testing.assert_allclose(Push(radius=0.1).reward(after), [0.5, 15])
+    # From 0.5 + 0.2 to 0.5 + 0.1, and from 0.5 to nothing.
+    np.testing.assert_allclose(Push(radius=0.05).reward(after), [2, 10])
+    np.testing.assert_allclose(Push(radius=0.1).reward(after), [1, 5])
     np.testing.assert_array_equal(Push().reward(before), [0, 0])
 
 
@@ -168,6 +168,11 @@ def test_reward_of_picking_up_is_progress():
     ]
     for after, progress in expected:
         np.testing.assert_allclose(PickAndPlace().reward(after) * 0.05, progress, atol=1e-12)
+    # At the goal: what was left is nothing now, and 10 for it.
+    placed = state([[0, 0, 0.01], [0.12, 0.16, 0.05]], [0.022, 0.02], previous=held)
+    placed.object_position[1, 0] = goal[1]
+    way = 0.5 + np.hypot(0.04, 0.2) + 0.06
+    np.testing.assert_allclose(PickAndPlace().reward(placed), [0, 10 + way / 0.05], atol=1e-9)
 
 
 @pytest.mark.parametrize(("kind", "width"), [(Push, 3), (PickAndPlace, 4)])

@@ -16,12 +16,12 @@ from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.state import ArmState, Array
 
 _ATTEMPTS, _PAIRS = 30, 64
-# What success is worth: about as much as all the progress before.
-_BONUS = 10.0
 # Half the width of closed fingers, m.
 _HALF_A_TOOL = 0.01
-# To pick up, m: how much wider than the object fingers open on each side, and how near to it they
-# hold it; how high the tool comes; and what counts as the object's way while nothing holds it.
+# What it is worth to have picked up and placed.
+_BONUS = 10.0
+# Lengths to pick up, m: how much wider than the object fingers open on each side, and how near to
+# it they hold it; how high the tool comes; what the object's way counts as while nothing holds it.
 _ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 0.5
 
 
@@ -112,11 +112,10 @@ class Push:
     has to go round an obstacle.
 
     The reward of a step is its progress :math:`(w - w') / \text{radius}` on the way that is still
-    to go before and after it, and 10 at success. With the object at o, the goal at g and the tool
-    at t the way is
+    to go before and after it. With the object at o, the goal at g and the tool at t it is
 
     .. math::
-        w = |o - g| + \tfrac12 |t - b|
+        w = |o - g| + |t - b|
 
     where b is behind the object, seen from the goal, and at its upper half: panda-gym's dense
     reward :math:`-|o - g|` does not change before the first touch. Nothing is left of the way where
@@ -183,7 +182,7 @@ class Push:
         behind = place - (max(self.shape.half_extents[:2]) + _HALF_A_TOOL) * forward
         behind[:, 2] += self.shape.half_extents[2] / 2
         to_behind = np.linalg.norm(state.ee_position - behind, axis=1)
-        return _object_distance(state) + to_behind / 2
+        return _object_distance(state) + to_behind
 
 
 @dataclass(frozen=True)
@@ -197,7 +196,7 @@ class PickAndPlace:
     20 N, from which 1 kg slips whenever the arm starts to move fast. The action must move the
     fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs ``max_episode_steps=100``.
 
-    The reward of a step is that of :class:`Push`, with the way
+    The reward of a step is the progress, as in :class:`Push`, and 10 at success. The way is
 
     .. math::
         w = c + |t - o| + h + 3 f
@@ -265,7 +264,7 @@ class PickAndPlace:
                 "CartesianDelta(finger_step=0.04); this one has no finger_step."
             )
         if self.shaped and not self.sparse:
-            return _progress(state, self._way, self.radius)
+            return _progress(state, self._way, self.radius) + _BONUS * self.success(state)
         return _reward(_object_distance(state), self.radius, self.sparse)
 
     def success(self, state: ArmState) -> NDArray[np.bool_]:
@@ -302,11 +301,11 @@ def _reward(distance: Array, radius: float, sparse: bool) -> Array:
 
 
 def _progress(state: ArmState, way: Callable[[ArmState], Array], radius: float) -> Array:
-    """How much shorter a way has become in a step, in radii, and a bonus where it is done."""
+    """How much shorter a way has become in a step, in radii; none is left where it is done."""
     if state.previous is None:
         return np.zeros(len(state.goal))
-    done = _object_distance(state) < radius
-    return (way(state.previous) - np.where(done, 0, way(state))) / radius + _BONUS * done
+    left = np.where(_object_distance(state) < radius, 0, way(state))
+    return (way(state.previous) - left) / radius
 
 
 def _object_distance(state: ArmState) -> Array:
