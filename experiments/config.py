@@ -116,8 +116,8 @@ class Config:
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "jobs", "eval_episodes", "frames_per_batch")
-        counts += ("epochs", "minibatch", "checkpoint_every", "episode_steps", "hidden")
-        for name in counts:
+        more = ("epochs", "minibatch", "checkpoint_every", "episode_steps", "hidden")
+        for name in (*counts, *more):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}.")
