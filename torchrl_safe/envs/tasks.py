@@ -201,8 +201,8 @@ class PickAndPlace:
     .. math::
         w = c + |t - o| + h + 3 f
 
-    - c is :math:`|o - g|` while the object is held, and 0.5 m (where the goal is farther: always)
-      while it is not: to push it is no progress.
+    - c is :math:`|o - g|` while the object is held, and 0.5 m, its largest value, while it is not:
+      to push it is no progress.
     - h is how far the tool is too low to come from above: at a horizontal distance of up to 0.06 m
       it is to be as high above the object.
     - f is how far the fingers still have to move: to open by 0.02 m more than the object takes and,
