@@ -36,6 +36,17 @@ class Affine(torch.nn.Module):
         return self.loc + self.scale * x
 
 
+class Standardize(Affine):
+    """The same, and no further than five deviations from the middle, as is usual.
+
+    Random actions hardly ever touch an object: of what its velocities become when it is pushed they
+    tell nothing, and a hundred deviations would drown all else that a network sees.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x).clamp(-5, 5)
+
+
 class Agent(NamedTuple):
     """A policy, critics of the state, and the logarithm of the policy's deviation in all states."""
 
@@ -59,6 +70,7 @@ def make_actor(
     scale: Tensor,
     *,
     noise: Noise,
+    hidden: int = 64,
     log_std: float = 0.0,
 ) -> TensorDictModuleBase:
     """Makes a policy.
@@ -69,11 +81,12 @@ def make_actor(
         scale: what they are multiplied by before that, the same.
         noise: whether the policy's deviation is the same in every state, chosen in each state, or
             there is none: it then gives the action itself.
+        hidden: units in each of its two hidden layers.
         log_std: logarithm of a deviation that is the same in every state.
     """
     actions = env.action_spec.shape[-1]
     outputs = actions * (2 if noise == "chosen" else 1)
-    net = torch.nn.Sequential(Affine(loc, scale), _small_network(len(loc), outputs))
+    net = torch.nn.Sequential(Standardize(loc, scale), _small_network(len(loc), hidden, outputs))
     if noise == "none":
         policy = torch.nn.Sequential(net, torch.nn.Tanh())
         return TensorDictModule(policy, ["observation"], ["action"])
@@ -92,7 +105,7 @@ def make_actor(
     )
 
 
-def make_agent(env: EnvBase, *, gamma: float, log_std: float = 0.0) -> Agent:
+def make_agent(env: EnvBase, *, gamma: float, hidden: int = 64, log_std: float = 0.0) -> Agent:
     """Makes a policy and two critics of the state, with one output for each cost.
 
     Observations are standardized by what random actions bring about, and the critics predict
@@ -103,24 +116,25 @@ def make_agent(env: EnvBase, *, gamma: float, log_std: float = 0.0) -> Agent:
     Args:
         env: environment to read widths from, and to play in.
         gamma: discount of reward and costs.
+        hidden: units in each of the two hidden layers of every network.
         log_std: logarithm of the policy's deviation to start with.
     """
     loc, scale = _standardization(env, deviation=math.exp(log_std))
 
     def critic(outputs: int, out_key: str) -> ValueOperator:
-        net = _small_network(len(loc), outputs)
+        net = _small_network(len(loc), hidden, outputs)
         predict = torch.nn.Sequential(
-            torch.nn.Sequential(Affine(loc, scale), net), Affine(0.0, 1 / (1 - gamma))
+            torch.nn.Sequential(Standardize(loc, scale), net), Affine(0.0, 1 / (1 - gamma))
         )
         return ValueOperator(predict, in_keys=["observation"], out_keys=[out_key])
 
-    actor = make_actor(env, loc, scale, noise="same", log_std=log_std)
+    actor = make_actor(env, loc, scale, noise="same", hidden=hidden, log_std=log_std)
     parameter = actor.get_parameter("0.module.1.state_independent_scale")
     critics = critic(1, "state_value"), critic(num_costs(env), "cost_value")
     return Agent(actor, *critics, parameter)
 
 
-def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
+def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool, hidden: int = 64) -> QAgent:
     """Makes a policy and two critics of state and action, for algorithms that learn from replay.
 
     Args:
@@ -128,14 +142,16 @@ def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
         gamma: see :func:`make_agent`.
         stochastic: whether the policy is a distribution of which it chooses the width in every
             state, or gives the action itself.
+        hidden: see :func:`make_agent`.
     """
     loc, scale = _standardization(env)
-    actor = make_actor(env, loc, scale, noise="chosen" if stochastic else "none")
+    noise: Noise = "chosen" if stochastic else "none"
+    actor = make_actor(env, loc, scale, noise=noise, hidden=hidden)
     actions = env.action_spec.shape[-1]
 
     def critic(outputs: int, out_key: str) -> ValueOperator:
-        net = _small_network(len(loc) + actions, outputs)
-        predict = _OfStateAndAction(Affine(loc, scale), net, Affine(0.0, 1 / (1 - gamma)))
+        net = _small_network(len(loc) + actions, hidden, outputs)
+        predict = _OfStateAndAction(Standardize(loc, scale), net, Affine(0.0, 1 / (1 - gamma)))
         return ValueOperator(predict, in_keys=["observation", "action"], out_keys=[out_key])
 
     costs = num_costs(env)
@@ -144,7 +160,7 @@ def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool) -> QAgent:
 
 
 class _OfStateAndAction(torch.nn.Module):
-    def __init__(self, standardize: Affine, net: MLP, unit: Affine) -> None:
+    def __init__(self, standardize: Standardize, net: MLP, unit: Affine) -> None:
         super().__init__()
         self.standardize, self.net, self.unit = standardize, net, unit
 
@@ -176,8 +192,8 @@ def _standardization(env: EnvBase, *, deviation: float = 1.0) -> tuple[Tensor, T
     return -seen.mean(0) * scale, scale
 
 
-def _small_network(inputs: int, outputs: int) -> MLP:
-    net = MLP(inputs, outputs, num_cells=[64, 64], activation_class=torch.nn.Tanh)
+def _small_network(inputs: int, hidden: int, outputs: int) -> MLP:
+    net = MLP(inputs, outputs, num_cells=[hidden, hidden], activation_class=torch.nn.Tanh)
     # Nearly the same action and value everywhere to start with.
     torch.nn.init.orthogonal_(net[-1].weight, 0.01)
     torch.nn.init.zeros_(net[-1].bias)

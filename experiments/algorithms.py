@@ -139,7 +139,9 @@ class OnPolicy:
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
-        agent = make_agent(env, gamma=config.gamma, log_std=config.first_log_std)
+        agent = make_agent(
+            env, gamma=config.gamma, hidden=config.hidden, log_std=config.first_log_std
+        )
         networks = agent.actor, agent.critic, agent.cost_critic
         loss = self.loss(*networks, num_costs=num_costs(env))
         discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
@@ -188,7 +190,9 @@ class OffPolicy:
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
-        agent = make_q_agent(env, gamma=config.gamma, stochastic=self.stochastic)
+        agent = make_q_agent(
+            env, gamma=config.gamma, stochastic=self.stochastic, hidden=config.hidden
+        )
         spec = env.action_spec_unbatched
         loss = self.loss(
             agent.actor,

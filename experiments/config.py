@@ -42,6 +42,8 @@ class Config:
 
     arm: Literal["panda", "iiwa", "xarm6", "xarm7", "ur5", "ur10"] = "panda"
     """Robot arm."""
+    task: Literal["reach", "push", "pick-and-place"] = "reach"
+    """What the arm is to do."""
     obstacles: Literal["none", "in-front", "scattered", "moving", "human"] = "in-front"
     """What is in the way."""
     action: Action = "cartesian"
@@ -93,6 +95,8 @@ class Config:
     episode_steps: int | None = None
     """Control steps after which an episode to learn from is cut off, if not at the limit of the
     environment; evaluations always play to that."""
+    hidden: int = 64
+    """Units in each of the two hidden layers of every network."""
     first_log_std: float = 0.0
     """Logarithm of the policy's standard deviation at the start, before the squashing."""
     last_log_std: float = -1.5
@@ -112,7 +116,8 @@ class Config:
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "jobs", "eval_episodes", "frames_per_batch")
-        for name in (*counts, "epochs", "minibatch", "checkpoint_every", "episode_steps"):
+        more = ("epochs", "minibatch", "checkpoint_every", "episode_steps", "hidden")
+        for name in (*counts, *more):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}.")
@@ -129,7 +134,7 @@ class Config:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
-        for name in ("arm", "obstacles", "physics"):
+        for name in ("arm", "task", "obstacles", "physics"):
             value, own = getattr(self, name), getattr(Config, name)
             if self.paper and value != own:
                 raise ValueError(f"{name} must be {own} with paper, got {value}.")

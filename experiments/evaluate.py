@@ -92,7 +92,8 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
                 f"env must be given for a policy that was trained in {saved.settings['env']}."
             )
         known = {name: saved.settings[name] for name in _ENVIRONMENT}
-        # Policies of before there was a choice were trained with Bullet.
+        # Policies of before there was a choice were trained to reach, with Bullet.
+        known["task"] = saved.settings.get("task", "reach")
         known["physics"] = config.physics or saved.settings.get("physics", "bullet")
         if config.gui and known["physics"] != "bullet":
             raise ValueError(

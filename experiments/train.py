@@ -49,7 +49,11 @@ from torchrl_safe.envs import (
     NoObstacles,
     Obstacles,
     Physics,
+    PickAndPlace,
+    Push,
+    Reach,
     Scattered,
+    Task,
     gym,
     paper_env,
     paper_observation,
@@ -57,6 +61,12 @@ from torchrl_safe.envs import (
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.policy import save_policy
 
+# The tasks, with control steps enough for an episode.
+TASKS: dict[str, tuple[Task, int]] = {
+    "reach": (Reach(), 40),
+    "push": (Push(), 100),
+    "pick-and-place": (PickAndPlace(), 100),
+}
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 OBSTACLES: dict[str, Obstacles] = {
     "none": NoObstacles(),
@@ -65,7 +75,6 @@ OBSTACLES: dict[str, Obstacles] = {
     "moving": Moving(),
     "human": Human(),
 }
-ACTIONS: dict[str, ActionMode] = {"cartesian": CartesianDelta(), "joint": JointDelta()}
 PHYSICS: dict[str, Physics] = {"bullet": Bullet(), "mujoco": MuJoCo()}
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
@@ -88,6 +97,7 @@ def make_env(
     The sums, over each episode, are of what the arm has earned and cost, whatever an algorithm
     makes of it.
     """
+    task, steps = TASKS[config.task]
     settings: dict[str, Any] = {
         "observation": OBSERVATIONS[config.observation],
         "num_envs": num_envs,
@@ -101,17 +111,27 @@ def make_env(
     else:
         env = ArmEnv(
             ARMS[config.arm],
-            action=ACTIONS[config.action],
+            action=make_action(config),
+            task=task,
             obstacles=OBSTACLES[config.obstacles],
             costs=COSTS,
             physics=PHYSICS[config.physics],
-            **settings,
+            **{"max_episode_steps": steps, **settings},
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = ALGORITHMS[algorithm].transforms(config)
     if training:
         transforms += ALGORITHMS[algorithm].training_transforms(config)
     return TransformedEnv(env, Compose(sums, *transforms))
+
+
+def make_action(config: Config) -> ActionMode:
+    """Makes what an action does, as the task needs it."""
+    fingers = 0.04 if config.task == "pick-and-place" else None
+    if config.action == "joint":
+        return JointDelta(finger_step=fingers)
+    # As fast as an arm may reach, 1 m/s, a cube that is hit slides on for 0.2 m.
+    return CartesianDelta(step=0.05 if config.task == "reach" else 0.03, finger_step=fingers)
 
 
 @contextmanager

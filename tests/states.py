@@ -28,7 +28,7 @@ def make_state(**changes):
         "time": np.zeros(2),
         "trace": Trace(),
     }
-    arrays = {k: v if k == "trace" else np.asarray(v) for k, v in changes.items()}
+    arrays = {k: v if k in ("trace", "previous") else np.asarray(v) for k, v in changes.items()}
     return ArmState(**{**fields, **arrays})
 
 

@@ -54,7 +54,7 @@ def fields(env):
     """All that an ArmState tells, by name, but for signs of quaternions."""
     state = env.arm_state
     named = {**vars(state), **{f"trace {name}": part for name, part in state.trace.items()}}
-    del named["trace"]
+    del named["trace"], named["previous"]
     return {
         name: np.abs(part) if name.endswith("orientation") else part for name, part in named.items()
     }

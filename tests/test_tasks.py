@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
+import torch
 from states import make_state
+from tensordict import TensorDict
 from worlds import ARMS, Places, each_arm, rest, step
 
 from torchrl_safe.envs import (
@@ -109,16 +111,101 @@ def test_share_of_goals_on_the_table(share, low, high):
 
 @each_object_task
 @pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
-def test_rewards(kind, sparse):
+def test_rewards_of_panda_gym(kind, sparse):
     """The distance of object and goal, wherever the tool is; or -1 and 0."""
     state = make_state(
         goal=[[0.3, 0.4, 0.0], [0.5, 0.0, 0.25]],
         object_position=[[[0.0, 0.0, 0.0]], [[0.5, 0.0, 0.24]]],
         finger_position=np.zeros((2, 2)),
     )
-    task = kind(sparse=sparse)
+    task = kind(shaped=False, sparse=sparse)
     np.testing.assert_allclose(task.reward(state), [-1, 0] if sparse else [-0.5, -0.01])
     np.testing.assert_array_equal(task.success(state), [False, True])
+
+
+@each_object_task
+def test_sparse_is_sparse_with_shaping_too(kind):
+    state = make_state(finger_position=np.zeros((2, 2)))
+    np.testing.assert_array_equal(kind(sparse=True).reward(state), [-1, -1])
+
+
+def test_reward_of_pushing_is_progress():
+    """On the way of the cube, and on the tool's to the point behind it."""
+    # 0.02 m of cube and 0.01 m of fingers before the cube, seen along the way of (3, 4).
+    behind, goal = np.array([-0.018, -0.024, 0.01]), [[0.3, 0.4, 0.0]] * 2
+    before = make_state(goal=goal, ee_position=[np.add(behind, (0, 0, 0.2)), behind])
+    after = make_state(
+        goal=goal,
+        ee_position=[np.add(behind, (0, 0.1, 0)), behind],
+        # The second is pushed to where it counts as there.
+        object_position=[[[0, 0, 0]], [[0.3, 0.37, 0]]],
+        previous=before,
+    )
+    # From 0.5 + 0.2 to 0.5 + 0.1, and from 0.5 to nothing.
+    np.testing.assert_allclose(Push(radius=0.05).reward(after), [2, 10])
+    np.testing.assert_allclose(Push(radius=0.1).reward(after), [1, 5])
+    np.testing.assert_array_equal(Push().reward(before), [0, 0])
+
+
+def test_reward_of_picking_up_is_progress():
+    """Of the tool, to the cube from above, of the fingers, and of the cube once it is held."""
+    goal = [[0.12, 0.16, 0.0]] * 2
+
+    def state(places, openings, **settings):
+        fingers = [[opening, opening] for opening in openings]
+        return make_state(goal=goal, ee_position=places, finger_position=fingers, **settings)
+
+    # Closed above the cube: 0.1 m to go, 0.04 m to open, 0.02 m to close again. And as far beside
+    # it as it is high: 0.05 m, and 0.01 m too low where it has to be 0.04 m high.
+    closed = state([[0, 0, 0.1], [0.04, 0, 0.03]], [0, 0.01])
+    # Around it, with 0.01 m to close. And as far beside it in the air, open for whatever size.
+    around = state([[0, 0, 0.01], [0, 0.04, 0.2]], [0.03, 0.1], previous=closed)
+    held = state([[0, 0, 0.01], [0, 0.04, 0.2]], [0.022, 0.1], previous=around)
+    expected = [
+        (around, [0.1 + 0.18 - 0.01 - 0.03, 0.05 + 0.01 + 0.15 - np.hypot(0.04, 0.2) - 0.06]),
+        # From 0.5 m for what is not held to the 0.2 m that it is away.
+        (held, [0.5 - 0.2 + 3 * 0.008, 0]),
+    ]
+    for after, progress in expected:
+        np.testing.assert_allclose(PickAndPlace().reward(after) * 0.05, progress, atol=1e-12)
+    # At the goal: what was left is nothing now, and 10 for it.
+    placed = state([[0, 0, 0.01], [0.12, 0.16, 0.05]], [0.022, 0.02], previous=held)
+    placed.object_position[1, 0] = goal[1]
+    way = 0.5 + np.hypot(0.04, 0.2) + 0.06
+    np.testing.assert_allclose(PickAndPlace().reward(placed), [0, 10 + way / 0.05], atol=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "width"), [(Push, 3), (PickAndPlace, 4)])
+@pytest.mark.parametrize("name", ["panda", "xarm6"])
+def test_progress_adds_up_to_the_way(make_env, name, kind, width):
+    """Whatever happens in between: potentials leave nothing behind, in every episode."""
+    env = make_env(
+        ArmEnv,
+        ARMS[name],
+        num_envs=2,
+        task=kind(),
+        action=CartesianDelta(finger_step=0.04 if width == 4 else None),
+        obstacles=NoObstacles(),
+        max_episode_steps=7,
+        seed=0,
+    )
+    generator, total, episodes = torch.Generator().manual_seed(0), np.zeros(2), 0
+    env.reset()
+    start = env.task._way(env.arm_state)
+    for number in range(15):
+        done = step(env, 2 * torch.rand(2, width, generator=generator) - 1)
+        total += done["reward"][:, 0].numpy()
+        now = env.task._way(env.arm_state)
+        np.testing.assert_allclose(total, (start - now) / env.task.radius, atol=1e-5)
+        # The second world begins anew in the middle of an episode of the first.
+        again = done["done"] | (number == 4) * torch.tensor([[False], [True]])
+        if again.any():
+            env.reset(TensorDict({"_reset": again}, [2]))
+            rows = again[:, 0].numpy()
+            total[rows], start[rows] = 0, env.task._way(env.arm_state)[rows]
+            episodes += rows.sum()
+    assert episodes == 4
+    assert np.abs(total).max() > 0.1
 
 
 @pytest.mark.parametrize("kind", [Reach, Push, PickAndPlace])
@@ -203,7 +290,8 @@ def test_objects_lie_still(make_env, name):
 @each_arm
 def test_the_arm_pushes_the_object(make_env, arm):
     """Down before the cube, then into it: it goes where the tool goes, and the reward follows."""
-    env = make_env(ArmEnv, arm, task=Push(), obstacles=NoObstacles(), max_episode_steps=500, seed=1)
+    task = Push(shaped=False)
+    env = make_env(ArmEnv, arm, task=task, obstacles=NoObstacles(), max_episode_steps=500, seed=1)
     env.reset()
     start, goal = env.arm_state.object_position[0, 0], env.arm_state.goal[0]
     before, behind = start - (0.08, 0, 0), np.add(start, (0.05, 0, 0))

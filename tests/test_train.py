@@ -21,6 +21,7 @@ from experiments.config import OFF_POLICY, AlgorithmName, Config
 from experiments.learners import NoiseSchedule
 from experiments.report import save_animation, table
 from experiments.train import collecting, main, make_env, train
+from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
 
 KINDS = {"cpo", "cup", "ppo-saute", "td3-lagrangian"}
@@ -291,3 +292,42 @@ def test_noise_falls_from_batch_to_batch():
 def test_bad_settings(settings, message):
     with pytest.raises(ValueError, match=message):
         Config(**settings)
+
+
+@pytest.mark.parametrize(
+    ("task", "kind", "step", "fingers", "steps"),
+    [
+        ("reach", Reach, 0.05, 0, 40),
+        ("push", Push, 0.03, 0, 100),
+        ("pick-and-place", PickAndPlace, 0.03, 1, 100),
+    ],
+)
+def test_a_task_gets_the_action_and_the_time_it_needs(task, kind, step, fingers, steps):
+    env = make_env(Config(task=task, action="joint"), num_envs=1)
+    assert env.action_spec_unbatched.shape == (7 + fingers,)
+    env.close()
+    env = make_env(Config(task=task), num_envs=1)
+    assert isinstance(env.base_env.task, kind)
+    assert env.base_env.action_mode.step == step
+    assert env.action_spec_unbatched.shape == (3 + fingers,)
+    assert env.base_env.max_episode_steps == steps
+    env.close()
+
+
+def test_what_no_random_action_shows_drowns_nothing():
+    """A cube's speed is hardly ever seen before it is pushed."""
+    torch.manual_seed(0)
+    env = make_env(Config(task="push"), num_envs=2, seed=0)
+    standardize = make_agent(env, gamma=0.97).actor.get_submodule("0.module.0.0")
+    env.close()
+    middle = -standardize.loc / standardize.scale
+    deviations = torch.tensor([-100.0, -5.0, 3.0, 100.0])[:, None]
+    seen = standardize(middle + deviations / standardize.scale)
+    expected = torch.tensor([-5.0, -5.0, 3.0, 5.0])[:, None]
+    torch.testing.assert_close(seen, expected.expand_as(seen), rtol=0, atol=1e-4)
+
+
+def test_networks_are_as_wide_as_wanted():
+    agent = make_training(hidden=48)
+    widths = {parameter.shape[0] for parameter in agent.loss.parameters() if parameter.ndim == 2}
+    assert widths == {48, 3, 1}

@@ -279,7 +279,8 @@ class ArmEnv(EnvBase):
         if self.scene.motor_limits:
             joints, fingers = self._within_speed(joints, fingers)
         self._simulator.advance(joints, fingers)
-        self._state = state = self._simulator.state()
+        before = replace(self._state, previous=None)
+        self._state = state = replace(self._simulator.state(), previous=before)
         reward, cost, success = self._outcome(state)
         truncated = (state.step >= self.max_episode_steps)[:, None] & ~success
         return self._pack(

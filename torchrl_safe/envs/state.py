@@ -128,6 +128,8 @@ class ArmState:
         step: control steps since the episode began, int, ``(N,)``; 0 after a reset.
         time: simulated time since the episode began, s, ``(N,)``.
         trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
+        previous: the state in which the control step began, without its own; ``None`` where a
+            reset was the last thing that happened.
     """
 
     joint_position: Array
@@ -154,3 +156,4 @@ class ArmState:
     step: NDArray[np.int_]
     time: Array
     trace: Mapping[str, Array] = field(default_factory=Trace)
+    previous: ArmState | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Real
 from typing import Protocol, runtime_checkable
@@ -15,6 +16,13 @@ from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.state import ArmState, Array
 
 _ATTEMPTS, _PAIRS = 30, 64
+# Half the width of closed fingers, m.
+_HALF_A_TOOL = 0.01
+# What it is worth to have picked up and placed.
+_BONUS = 10.0
+# Lengths to pick up, m: how much wider than the object fingers open on each side, and how near to
+# it they hold it; how high the tool comes; what the object's way counts as while nothing holds it.
+_ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 0.5
 
 
 @runtime_checkable
@@ -95,13 +103,26 @@ class Reach:
 
 @dataclass(frozen=True)
 class Push:
-    """Push a cube over the table to a goal.
+    r"""Push a cube over the table to a goal.
 
-    Reward, success within 0.05 m and the cube are those of panda-gym's PandaPush (Gallouédec et
-    al. 2021, arXiv 2106.13687): the reward of a step is minus the distance between cube and goal,
-    in metres; success ends the episode (``terminated``). Other than there, the cube never starts
-    near its goal, so that there is a way to go and room for an obstacle on it. It takes longer than
-    reaching: give the environment ``max_episode_steps=200``.
+    Goals, success within 0.05 m and the cube are those of panda-gym's PandaPush (Gallouédec et
+    al. 2021, arXiv 2106.13687); success ends the episode (``terminated``). Other than there, the
+    cube never starts near its goal, so that there is a way to go and room for an obstacle on it. It
+    takes longer than reaching: give the environment ``max_episode_steps=60``, or 200 where the cube
+    has to go round an obstacle.
+
+    The reward of a step is its progress :math:`(w - w') / \text{radius}` on the way that is still
+    to go before and after it. With the object at o, the goal at g and the tool at t it is
+
+    .. math::
+        w = |o - g| + |t - b|
+
+    where b is behind the object, seen from the goal, and at its upper half: panda-gym's dense
+    reward :math:`-|o - g|` does not change before the first touch. Nothing is left of the way where
+    the task is done. Progress is potential-based shaping (Ng et al. 1999),
+    :math:`\gamma \Phi(s') - \Phi(s)` with :math:`\Phi = -w / \text{radius}`, of the reward
+    :math:`-(1 - \gamma) w' / \text{radius}`, for every discount :math:`\gamma`: the same policies
+    are best with and without it, and a critic has less to learn.
 
     Args:
         region: where the cube and its goal are drawn, uniformly; heights do not matter. ``None``
@@ -109,6 +130,8 @@ class Push:
         radius: distance between cube and goal at which the task is done, m.
         distance: smallest distance between cube and goal at the start, m.
         shape: the object; it starts upright on the table.
+        shaped: reward progress. ``False`` rewards with minus the distance between cube and goal,
+            in metres, as panda-gym does.
         sparse: reward each step with -1 until success and 0 at success, instead.
 
     Raises:
@@ -127,11 +150,12 @@ class Push:
     radius: float = 0.05
     distance: float = 0.3
     shape: Shape = Box((0.02, 0.02, 0.02), mass=1.0)
+    shaped: bool = True
     sparse: bool = False
 
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
-        check_flag(sparse=self.sparse)
+        check_flag(shaped=self.shaped, sparse=self.sparse)
         _check_object(self.shape)
         check_positive(distance=self.distance)
 
@@ -143,22 +167,46 @@ class Push:
         return _apart(rng, self.region or goals, self.distance, self.shape)
 
     def reward(self, state: ArmState) -> Array:
+        if self.shaped and not self.sparse:
+            return _progress(state, self._way, self.radius)
         return _reward(_object_distance(state), self.radius, self.sparse)
 
     def success(self, state: ArmState) -> NDArray[np.bool_]:
         return _object_distance(state) < self.radius
 
+    def _way(self, state: ArmState) -> Array:
+        """How far it is still to go, m."""
+        place = state.object_position[:, 0]
+        forward = (state.goal - place) * (1, 1, 0)
+        forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
+        behind = place - (max(self.shape.half_extents[:2]) + _HALF_A_TOOL) * forward
+        behind[:, 2] += self.shape.half_extents[2] / 2
+        to_behind = np.linalg.norm(state.ee_position - behind, axis=1)
+        return _object_distance(state) + to_behind
+
 
 @dataclass(frozen=True)
 class PickAndPlace:
-    """Grasp a cube and bring it to a goal, in the air or on the table.
+    r"""Grasp a cube and bring it to a goal, in the air or on the table.
 
-    Reward, success within 0.05 m, the size of the cube and the share of goals on the table are
+    Success within 0.05 m, the size of the cube and the share of goals on the table are
     those of panda-gym's PandaPickAndPlace (Gallouédec et al. 2021, arXiv 2106.13687); success
     ends the episode (``terminated``). As in :class:`Push`, the cube never starts near its goal.
     It weighs 0.1 kg instead of 1 kg: panda-gym's fingers press with 170 N, a Panda's URDF allows
     20 N, from which 1 kg slips whenever the arm starts to move fast. The action must move the
     fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs ``max_episode_steps=100``.
+
+    The reward of a step is the progress, as in :class:`Push`, and 10 at success. The way is
+
+    .. math::
+        w = c + |t - o| + h + 3 f
+
+    - c is :math:`|o - g|` while the object is held, and 0.5 m, its largest value, while it is not:
+      to push it is no progress.
+    - h is how far the tool is too low to come from above: at a horizontal distance of up to 0.06 m
+      it is to be as high above the object.
+    - f is how far the fingers still have to move: to open by 0.02 m more than the object takes and,
+      when the tool point is in the object, to close on it.
 
     Args:
         region: where the goal is drawn, uniformly, and the cube below; a goal in the air is not
@@ -167,6 +215,8 @@ class PickAndPlace:
         distance: smallest horizontal distance between cube and goal at the start, m.
         on_table: share of the goals that lie on the table.
         shape: the object; it starts upright on the table.
+        shaped: reward progress. ``False`` rewards with minus the distance between cube and goal,
+            in metres, as panda-gym does.
         sparse: reward each step with -1 until success and 0 at success, instead.
 
     Raises:
@@ -185,11 +235,12 @@ class PickAndPlace:
     distance: float = 0.3
     on_table: float = 0.3
     shape: Shape = Box((0.02, 0.02, 0.02), mass=0.1)
+    shaped: bool = True
     sparse: bool = False
 
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
-        check_flag(sparse=self.sparse)
+        check_flag(shaped=self.shaped, sparse=self.sparse)
         _check_object(self.shape)
         check_positive(distance=self.distance)
         if not isinstance(self.on_table, Real) or not 0 <= self.on_table <= 1:
@@ -212,10 +263,25 @@ class PickAndPlace:
                 "action must move the fingers to pick something up, such as "
                 "CartesianDelta(finger_step=0.04); this one has no finger_step."
             )
+        if self.shaped and not self.sparse:
+            return _progress(state, self._way, self.radius) + _BONUS * self.success(state)
         return _reward(_object_distance(state), self.radius, self.sparse)
 
     def success(self, state: ArmState) -> NDArray[np.bool_]:
         return _object_distance(state) < self.radius
+
+    def _way(self, state: ArmState) -> Array:
+        """How far it is still to go, m."""
+        from_object = state.ee_position - state.object_position[:, 0]
+        distance, half = np.linalg.norm(from_object, axis=1), min(self.shape.half_extents)
+        beside = np.linalg.norm(from_object[:, :2], axis=1)
+        too_low = np.maximum(0, np.minimum(beside, _ABOVE) - from_object[:, 2])
+        opening = state.finger_position.mean(axis=1)
+        inside, to_close = distance < half, np.abs(opening - half)
+        fingers = np.where(inside, to_close, np.maximum(0, half + _ROOM - opening) + _ROOM)
+        held = inside & (to_close < _CLOSED)
+        carrying = np.where(held, np.minimum(_object_distance(state), _FAR), _FAR)
+        return carrying + distance + too_low + 3 * fingers
 
 
 def _check(region: Region | None, radius: float) -> None:
@@ -232,6 +298,14 @@ def _check_object(shape: Shape) -> None:
 
 def _reward(distance: Array, radius: float, sparse: bool) -> Array:
     return -(distance >= radius).astype(float) if sparse else -distance
+
+
+def _progress(state: ArmState, way: Callable[[ArmState], Array], radius: float) -> Array:
+    """How much shorter a way has become in a step, in radii; none is left where it is done."""
+    if state.previous is None:
+        return np.zeros(len(state.goal))
+    left = np.where(_object_distance(state) < radius, 0, way(state))
+    return (way(state.previous) - left) / radius
 
 
 def _object_distance(state: ArmState) -> Array:

@@ -134,6 +134,7 @@ class BulletSimulator:
             trace=Trace(
                 split(np.array(self._measured), self._trace_parts) if self._trace_parts else {}
             ),
+            previous=None,
         )
 
     def tool_at(self, joints: Array) -> tuple[Array, Array]:
