@@ -128,6 +128,11 @@ class ArmState:
         step: control steps since the episode began, int, ``(N,)``; 0 after a reset.
         time: simulated time since the episode began, s, ``(N,)``.
         trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
+        shield_correction: how far the joint targets of the last control step were from those that
+            the action asked for, rad, ``(N,)``: the length of the difference. 0 after a reset;
+            None without a :class:`~torchrl_safe.envs.Shield`.
+        shield_braked: in which worlds the shield held the arm still because nothing else was safe,
+            bool, ``(N,)``. None without a shield.
     """
 
     joint_position: Array
@@ -154,3 +159,5 @@ class ArmState:
     step: NDArray[np.int_]
     time: Array
     trace: Mapping[str, Array] = field(default_factory=Trace)
+    shield_correction: Array | None = None
+    shield_braked: NDArray[np.bool_] | None = None
