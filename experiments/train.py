@@ -27,7 +27,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, Training
 from experiments.config import AlgorithmName, Config
 from experiments.files import is_new, write_whole
-from experiments.log import Log, figures, score, versions
+from experiments.log import Log, figures, score, summed_costs, versions
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
 from torchrl_safe.collectors import ResumableCollector
@@ -104,6 +104,7 @@ def make_env(
             obstacles=OBSTACLES[config.obstacles],
             costs=COSTS,
             physics=PHYSICS[config.physics],
+            shield=ALGORITHMS[algorithm].shield,
             **settings,
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
@@ -193,6 +194,7 @@ def train(
             collector.update_policy_weights_()
             bar.update(batch.numel())
             row = figures(episodes, training.loss, tuple(COSTS))
+            row |= summed_costs(batch, log.rows, tuple(COSTS))
             bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
             log.add({"frames": log.frames + batch.numel(), **row})
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
@@ -258,7 +260,7 @@ def start(config: Config) -> dict[str, Any]:
 def main(config: Config) -> None:
     """Trains and evaluates each algorithm, then writes the comparison."""
     results = start(config)
-    for algorithm in config.algorithms:
+    for algorithm in config.chosen:
         if algorithm in results["algorithms"]:
             continue
         actor, results["algorithms"][algorithm] = train_and_evaluate(config, algorithm)
