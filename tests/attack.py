@@ -5,6 +5,7 @@ own doing if its closest point was moving towards the obstacle's at that moment.
 """
 
 import argparse
+import sys
 from itertools import product
 from time import perf_counter
 
@@ -79,7 +80,9 @@ def corners(env, rng):
     before = getattr(env, "before", None)
     new = rng.choice([-1.0, 1.0], shape)
     change = rng.random(shape) < 0.15
-    env.before = new if before is None else np.where(change | (state.step == 0)[:, None], new, before)
+    env.before = (
+        new if before is None else np.where(change | (state.step == 0)[:, None], new, before)
+    )
     return env.before
 
 
@@ -146,19 +149,10 @@ def act(env, action):
     return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
 
 
-def make(arm, action, obstacles, physics, num_envs, *, shield=Shield(), seed=0, **settings):
+def make(arm, action, obstacles, physics, num_envs, **settings):
     """A shielded environment that measures what a tally notes."""
-    return ArmEnv(
-        arm,
-        num_envs=num_envs,
-        action=action,
-        obstacles=obstacles,
-        physics=physics,
-        costs=COSTS,
-        shield=shield,
-        seed=seed,
-        **settings,
-    )
+    fixed = {"action": action, "obstacles": obstacles, "physics": physics, "num_envs": num_envs}
+    return ArmEnv(arm, **{"costs": COSTS, "shield": Shield(), "seed": 0, **fixed, **settings})
 
 
 def main():
@@ -185,9 +179,9 @@ def main():
         )
         tally = play(env, ATTACKS[attack], each, seed)
         env.close()
-        print(
-            f"{arm} {action} {layout} {attack}: {tally}, {perf_counter() - begin:.0f} s", flush=True
-        )
+        line = f"{arm} {action} {layout} {attack}: {tally}, {perf_counter() - begin:.0f} s"
+        sys.stdout.write(line + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

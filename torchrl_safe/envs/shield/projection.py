@@ -14,53 +14,75 @@ _ITERATIONS_PER_UNKNOWN = 8
 _TOLERANCE, _PARALLEL = 1e-9, 1e-10
 
 
-def project(wanted: Array, rows: Array, least: Array) -> tuple[Array, NDArray[np.bool_]]:
+def project(
+    wanted: Array, rows: Array, least: Array, lower: Array, upper: Array
+) -> tuple[Array, NDArray[np.bool_]]:
     r"""Returns the points nearest to ``wanted`` at which linear inequalities hold.
 
     .. math::
-        \min_x \tfrac12 |x - w|^2 \quad \text{such that} \quad A x \ge b
+        \min_x \tfrac12 |x - w|^2 \quad \text{such that} \quad A x \ge b, \quad l \le x \le u
 
     Solved exactly, by the dual active-set method of Goldfarb and Idnani (1983, Mathematical
-    Programming 27): it begins at ``wanted``, and as long as a constraint is violated, moves onto
-    the most violated one while those that are already active stay so. It ends after finitely many
-    steps, and knows when there is no solution. Most problems take none or one, and all N take
-    their steps together. The result of a problem does not depend on the others.
+    Programming 27). It begins with the bounds, which need no search. Then, as long as an inequality
+    is violated, it moves onto the most violated one while those that are already active stay so,
+    and drops those that no longer push. It ends after finitely many steps, and knows when there is
+    no solution. Most problems take none or one, and all N take their steps together. The result
+    of a problem does not depend on the others.
 
     Args:
         wanted: w, ``(N, n)``.
         rows: A, ``(N, r, n)``.
-        least: b, ``(N, r)``.
+        least: b, ``(N, r)``; -inf for rows that do not count.
+        lower: l, ``(N, n)``; may be infinite.
+        upper: u, ``(N, n)``, not less than l; may be infinite.
 
     Returns:
         The points, ``(N, n)``, and which problems have a solution, ``(N,)``. Where there is
         none, the point has no meaning.
 
     Examples:
-        >>> project(np.array([[-1.0, 2.0]]), np.eye(2)[None], np.zeros((1, 2)))
-        (array([[0., 2.]]), array([ True]))
+        >>> wanted, bound = np.array([[-1.0, 2.0]]), np.full((1, 2), 1.5)
+        >>> project(wanted, np.array([[[1.0, 0.0]]]), np.zeros((1, 1)), -bound, bound)
+        (array([[0. , 1.5]]), array([ True]))
     """
-    lengths = np.sqrt((rows * rows).sum(axis=2))
-    flat = lengths <= _PARALLEL
-    scale = 1 / np.where(flat, 1.0, lengths)
-    rows, least = rows * scale[..., None], least * scale
-    # What does not depend on x holds or does not.
-    solved = ~(flat & (least > _TOLERANCE)).any(axis=1)
-    least = np.where(flat, -np.inf, least)
-    point = wanted.copy()
-    violated = ((rows * wanted[:, None]).sum(axis=2) < least - _TOLERANCE).any(axis=1)
-    chosen = np.flatnonzero(solved & violated)
-    if len(chosen):
-        point[chosen], solved[chosen] = _active_set(wanted[chosen], rows[chosen], least[chosen])
+    point = np.clip(wanted, lower, upper)
+    solved = ((rows * point[:, None]).sum(axis=2) >= least - _TOLERANCE).all(axis=1)
+    open_ = np.flatnonzero(~solved)
+    if len(open_):
+        bounds = lower[open_], upper[open_]
+        point[open_], solved[open_] = _active_set(
+            wanted[open_], point[open_], *_unit(rows[open_], least[open_], *bounds)
+        )
     return point, solved
 
 
-def _active_set(point: Array, rows: Array, least: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Moves violated problems, one constraint at a time; rows have unit length."""
+def _unit(rows: Array, least: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """All inequalities, the bounds at the end, with rows of unit length; or of none."""
+    lengths = np.sqrt((rows * rows).sum(axis=2))
+    # What does not depend on x always holds, or never: it is then a row that nothing satisfies.
+    flat = lengths <= _PARALLEL
+    scale = 1 / np.where(flat, 1.0, lengths)
+    rows = np.where(flat[..., None], 0.0, rows * scale[..., None])
+    each = np.broadcast_to(np.eye(rows.shape[2]), (len(rows), *2 * rows.shape[2:]))
+    return (
+        np.concatenate([rows, each, -each], axis=1),
+        np.concatenate([least * scale, lower, -upper], axis=1),
+    )
+
+
+def _active_set(
+    wanted: Array, point: Array, rows: Array, least: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Adds one constraint after the other, to begin with the bounds at which ``point`` is."""
     count, width = point.shape
-    each = np.arange(count)
-    # Up to n active constraints of each problem: their rows, multipliers and numbers.
-    normals, multipliers = np.zeros((count, width, width)), np.zeros((count, width))
-    active = np.full((count, width), -1)
+    each, joint = np.arange(count), np.arange(width)
+    # Up to n active constraints of each problem: their rows, multipliers and numbers. A bound that
+    # is active at the beginning is in the slot of its unknown.
+    push = point - wanted
+    normals = np.sign(push)[:, :, None] * np.eye(width)
+    multipliers = np.abs(push)
+    active = rows.shape[1] - np.where(push > 0, 2, 1) * width + joint
+    active[push == 0] = -1
     # The constraint that is being added, and its multiplier so far.
     entering, weight = np.full(count, -1), np.zeros(count)
     solved, open_ = np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
@@ -77,10 +99,10 @@ def _active_set(point: Array, rows: Array, least: Array) -> tuple[Array, NDArray
             break
         normal = rows[each, entering]
         # The part of it that the active ones do not span, and how much of each is in the rest.
-        gram = (normals[:, :, None] * normals[:, None]).sum(axis=3)
-        gram[:, range(width), range(width)] += ~held
-        shares = np.linalg.solve(gram, (normals * normal[:, None]).sum(axis=2)[..., None])[..., 0]
-        free = normal - (normals * shares[..., None]).sum(axis=1)
+        gram = normals @ normals.transpose(0, 2, 1)
+        gram[:, joint, joint] += ~held
+        shares = np.linalg.solve(gram, normals @ normal[:, :, None])[:, :, 0]
+        free = normal - (normals * shares[:, :, None]).sum(axis=1)
         length = (free * normal).sum(axis=1)
         new = length > _PARALLEL
         # How far until the constraint holds, or the multiplier of an active one is used up.
@@ -92,19 +114,16 @@ def _active_set(point: Array, rows: Array, least: Array) -> tuple[Array, NDArray
         # Neither will ever happen: there is no solution.
         open_ &= np.isfinite(step)
         step = np.where(open_, step, 0.0)
-        point += np.where(new, step, 0.0)[:, None] * free
+        point = point + np.where(new, step, 0.0)[:, None] * free
         multipliers -= np.where(held, step[:, None] * shares, 0.0)
         weight += step
-        joins = open_ & (full <= limits[each, last])
-        # Its slot: the first that is not taken. There is one, for it is not spanned by the others.
-        drops, slot = open_ & ~joins, np.where(joins, held.argmin(axis=1), last)
-        for where, row, multiplier, number in (
-            (joins, normal, weight, entering),
-            (drops, np.zeros_like(normal), np.zeros(count), np.full(count, -1)),
-        ):
-            chosen = np.flatnonzero(where)
-            normals[chosen, slot[chosen]] = row[chosen]
-            multipliers[chosen, slot[chosen]] = multiplier[chosen]
-            active[chosen, slot[chosen]] = number[chosen]
-        entering, weight = np.where(joins, -1, entering), np.where(joins, 0.0, weight)
+        joins = np.flatnonzero(open_ & (full <= limits[each, last]))
+        drops = np.flatnonzero(open_ & (full > limits[each, last]))
+        # Into the first slot that is not taken: there is one, for the others do not span it.
+        slot = held[joins].argmin(axis=1)
+        normals[joins, slot], multipliers[joins, slot] = normal[joins], weight[joins]
+        active[joins, slot] = entering[joins]
+        entering[joins], weight[joins] = -1, 0.0
+        slot = last[drops]
+        normals[drops, slot], multipliers[drops, slot], active[drops, slot] = 0.0, 0.0, -1
     return point, solved

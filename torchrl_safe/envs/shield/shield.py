@@ -15,9 +15,9 @@ from torchrl_safe.envs.shield.projection import project
 from torchrl_safe.envs.state import ArmState, Array
 from torchrl_safe.envs.vectors import cross
 
-# The nearest point of a shape may be another one at the end of the step, and the way there is
+# The nearest point of a shape may be another one at the end of a control step, and the way is
 # curved: for each radian that the joints turn, a distance can be off by this much, m.
-_ERROR = 0.25
+_ERROR = 0.1
 # Of what the joints hardly move, m/rad, and of joints without limits, rad.
 _SHORTEST, _FAR = 1e-3, 1e3
 
@@ -95,8 +95,8 @@ class Shield:
       and leaves again: the distances at both ends are checked, those between follow from them to
       within the same margin.
 
-    With obstacles that move, their velocity counts: the arm gives way as far as its joints allow. As
-    their future is unknown, the guarantee is another: the arm is not the one that moves into
+    With obstacles that move, their velocity counts: the arm gives way as far as its joints allow.
+    As their future is unknown, the guarantee is another: the arm is not the one that moves into
     contact, if they do not become faster than ``obstacle_speed``. The arm's own links and what its
     gripper holds are not looked at.
 
@@ -182,27 +182,24 @@ class Shield:
         now = self._measure(step, np.arange(len(angles)), angles, held)
         lower, upper = self._bounds(step, now, longest)
         least = self._least(step, now) - (now.fingers * opening[:, None]).sum(axis=2)
-        parts = [
-            (now.joints, _attainable(now.joints, least, lower, upper)),
-            *self._walls(step),
-            *_box(lower, upper),
-        ]
-        rows, least = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-        change, solved = project(asked, rows, least)
+        least = _attainable(now.joints, least, lower, upper)
+        rows, least = self._with_walls(step, now.joints, least)
+        change, solved = project(asked, rows, least, lower, upper)
         # Where the end of the step could be too near, that is measured as well.
         left = now.room - now.closing + (now.joints * change[:, None]).sum(axis=2)
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
         again = np.flatnonzero(solved & doubt)
         if len(again):
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
-            more = _needed(step, now.of(again), then) + (then.joints * change[again][:, None]).sum(
-                axis=2
-            )
-            more = _attainable(then.joints, more, lower[again], upper[again])
+            turned = (then.joints * change[again][:, None]).sum(axis=2)
+            needed = _needed(step, now.of(again), then) + turned
+            needed = _attainable(then.joints, needed, lower[again], upper[again])
             change[again], solved[again] = project(
                 asked[again],
                 np.concatenate([rows[again], then.joints], axis=1),
-                np.concatenate([least[again], more], axis=1),
+                np.concatenate([least[again], needed], axis=1),
+                lower[again],
+                upper[again],
             )
         still = ~solved[:, None]
         if fingers.shape[1]:
@@ -262,16 +259,17 @@ class Shield:
             np.clip(turning + slack, lower, np.minimum(upper, _FAR)),
         )
 
-    def _walls(self, step: _Step) -> list[tuple[Array, Array]]:
-        """The inequalities that keep the tool point in the workspace."""
+    def _with_walls(self, step: _Step, rows: Array, least: Array) -> tuple[Array, Array]:
+        """Adds the inequalities that keep the tool point in the workspace."""
         if self.workspace is None:
-            return []
-        tool = step.state.ee_position
+            return rows, least
+        tool, walls = step.state.ee_position, self.workspace
         linear = step.simulator.jacobian(step.state.joint_position)[:, :3]
-        return [
-            (linear, -step.share * (tool - self.workspace.low)),
-            (-linear, -step.share * (self.workspace.high - tool)),
-        ]
+        room = np.concatenate([tool - walls.low, walls.high - tool], axis=1)
+        return (
+            np.concatenate([rows, linear, -linear], axis=1),
+            np.concatenate([least, -step.share * room], axis=1),
+        )
 
 
 def _needed(step: _Step, now: _Pairs, then: _Pairs) -> Array:
@@ -288,9 +286,3 @@ def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
     """Asks for no more than half of what the joints can do: else for not coming nearer."""
     best = np.where(rows > 0, rows * upper[:, None], rows * lower[:, None]).sum(axis=2)
     return np.minimum(least, np.maximum(best / 2, 0))
-
-
-def _box(lower: Array, upper: Array) -> list[tuple[Array, Array]]:
-    """The bounds as inequalities."""
-    each = np.broadcast_to(np.eye(lower.shape[1]), (*lower.shape, lower.shape[1]))
-    return [(each, lower), (-each, -upper)]

@@ -16,9 +16,10 @@ from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.bodies import LoadedArm, add_shape, load_arm, load_furniture
 from torchrl_safe.envs.physics.bullet.engine import pybullet
 from torchrl_safe.envs.physics.scene import Scene
+from torchrl_safe.envs.physics.screws import distance_jacobian
 from torchrl_safe.envs.physics.simulator import Nearest
 from torchrl_safe.envs.state import Array
-from torchrl_safe.envs.vectors import cross, turn
+from torchrl_safe.envs.vectors import turn
 
 if TYPE_CHECKING:
     from torchrl_safe.envs.physics.bullet.physics import Bullet
@@ -130,10 +131,8 @@ class Ruler:
                 for slot, found in enumerate(points, number * _PAIRS):
                     links[row, slot], distance[row, slot] = found[3], found[8]
                     point[row, slot], normal[row, slot] = found[5], found[7]
-        arm = point[:, :, None] - anchor[:, None]
-        turning = cross(axis[:, None], arm)
-        velocity = np.where(self._slides[:, None], axis[:, None], turning)
-        jacobian = (velocity * normal[:, :, None]).sum(axis=3) * self._moves[links]
+        jacobian = distance_jacobian(point, normal, anchor, axis, self._slides)
+        jacobian *= self._moves[links]
         return Nearest(distance, normal, point, jacobian, self._other)
 
 

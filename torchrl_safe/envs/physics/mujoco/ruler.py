@@ -16,9 +16,9 @@ from torchrl_safe.envs.physics.mujoco.bodies import TABLE, add_obstacle, add_tab
 from torchrl_safe.envs.physics.mujoco.contacts import level_bodies
 from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
 from torchrl_safe.envs.physics.scene import Scene
+from torchrl_safe.envs.physics.screws import distance_jacobian
 from torchrl_safe.envs.physics.simulator import Nearest
 from torchrl_safe.envs.state import Array
-from torchrl_safe.envs.vectors import cross
 
 # Distances are exact to this, m: curved shapes else take twice as long, for nanometres.
 _EXACT = 1e-3
@@ -140,10 +140,8 @@ class Ruler:
         inside = ((self._centres[rows][:, self._geom] - point) * normal).sum(axis=2) < 0
         sign = np.where(inside, -1.0, 1.0)
         normal, distance = normal * sign[..., None], distance * sign
-        axis = self._axes[rows][:, None, self._joints]
-        arm = point[:, :, None] - self._anchors[rows][:, None, self._joints]
-        velocity = np.where(self._slides[:, None], axis, cross(axis, arm))
-        jacobian = (velocity * normal[:, :, None]).sum(axis=3) * self._moves
+        anchor, axis = self._anchors[rows][:, self._joints], self._axes[rows][:, self._joints]
+        jacobian = distance_jacobian(point, normal, anchor, axis, self._slides) * self._moves
         return Nearest(np.where(found, distance, np.inf), normal, point, jacobian, self._thing)
 
 
