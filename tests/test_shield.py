@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.optimize import linprog
 from states import make_state
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 from worlds import ENGINES, Places, each_arm, step
@@ -37,6 +38,8 @@ from torchrl_safe.envs.shield.projection import project
 
 # Of the room above the margin, what a control step of 1/20 s may use up.
 SHARE = 1 - np.exp(-5 / 20)
+# A Cartesian action towards the table.
+DOWN = torch.tensor([0.0, 0.0, -1.0])
 
 
 def brute_force(wanted, rows, least):
@@ -309,33 +312,27 @@ def test_the_batch_holds_the_sampled_action(make_env, engine):
 
 
 def test_checkpoints_bring_the_correction_back(make_env, engine):
-    settings = {"num_envs": 2, "action": JointDelta(), "shield": Shield(), "seed": 0}
-    env, other = (make_env(ArmEnv, **settings) for _ in range(2))
+    env, other = (make_env(ArmEnv, num_envs=2, shield=Shield(), seed=0) for _ in range(2))
     env.reset()
-    for _ in range(4):
-        step(env, 1.0)
+    for _ in range(5):
+        step(env, DOWN)
     assert env.arm_state.shield_correction.any()
     other.load_state_dict(env.state_dict())
     for name in ("shield_correction", "shield_braked", "joint_position"):
         np.testing.assert_array_equal(getattr(env.arm_state, name), getattr(other.arm_state, name))
-    after = [step(each, 1.0)["shield_correction"] for each in (env, other)]
+    after = [step(each, DOWN)["shield_correction"] for each in (env, other)]
     torch.testing.assert_close(*after, rtol=0, atol=0)
 
 
 def test_a_partial_reset_forgets_one_correction(make_env, engine):
-    env = make_env(ArmEnv, num_envs=2, action=JointDelta(), shield=Shield(), seed=0)
+    env = make_env(ArmEnv, num_envs=2, shield=Shield(), seed=0)
     env.reset()
-    before = [step(env, 1.0) for _ in range(4)][-1]["shield_correction"]
+    before = [step(env, DOWN) for _ in range(5)][-1]["shield_correction"]
     assert before.all()
     reset = torch.tensor([[True], [False]])
-    after = env.reset(before_reset(env, reset))["shield_correction"]
+    after = env.reset(TensorDict({"_reset": reset}, [2]))["shield_correction"]
     assert after[0].item() == 0
     assert after[1] == before[1]
-
-
-def before_reset(env, reset):
-    """What tells an environment which rows to reset."""
-    return env.fake_tensordict().select().set("_reset", reset)
 
 
 def test_a_world_is_the_same_alone_and_among_others(make_env, engine):

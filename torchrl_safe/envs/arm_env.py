@@ -285,7 +285,7 @@ class ArmEnv(EnvBase):
         return self._pack(
             observation=self._observe(self._state),
             success=np.zeros((self.num_envs, 1), dtype=bool),
-            **self._shield_keys(self._state),
+            **self._shield_keys(),
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -305,7 +305,7 @@ class ArmEnv(EnvBase):
         return self._pack(
             observation=self._observe(state),
             success=success,
-            **self._shield_keys(state),
+            **self._shield_keys(),
             reward=reward,
             cost=cost,
             terminated=success,
@@ -455,13 +455,10 @@ class ArmEnv(EnvBase):
     def _shield_state(self) -> dict[str, np.ndarray]:
         return {"shield_correction": self._correction, "shield_braked": self._braked}
 
-    def _shield_keys(self, state: ArmState) -> dict[str, np.ndarray]:
-        if state.shield_correction is None or state.shield_braked is None:
+    def _shield_keys(self) -> dict[str, np.ndarray]:
+        if self.shield is None:
             return {}
-        return {
-            "shield_correction": state.shield_correction[:, None],
-            "shield_braked": state.shield_braked[:, None],
-        }
+        return {name: array[:, None] for name, array in self._shield_state().items()}
 
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:
         self._draws[row] = pack(generator)
@@ -472,8 +469,9 @@ class ArmEnv(EnvBase):
         state = self._simulator.state()
         if self.shield is None:
             return state
-        copies = {name: array.copy() for name, array in self._shield_state().items()}
-        return replace(state, **copies)
+        return replace(
+            state, shield_correction=self._correction.copy(), shield_braked=self._braked.copy()
+        )
 
     def _observe(self, state: ArmState) -> Array:
         fields = self.observation(state).values()

@@ -131,7 +131,7 @@ class Ruler:
         self._place[rows], self._turn[rows] = position, orientation
         with quiet():
             self._batch.forward(rows.tolist(), stage=mujoco.mjtStage.mjSTAGE_POS)
-        ends = self._points[rows].reshape(len(rows), -1, 2, 3)
+        ends = self._points[rows].reshape(len(rows), len(self._thing), 2, 3)
         point, way = ends[:, :, 0], ends[:, :, 0] - ends[:, :, 1]
         distance = np.sqrt((way * way).sum(axis=2))
         found = distance > 0
