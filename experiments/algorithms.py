@@ -197,7 +197,6 @@ class OffPolicy:
     transforms: Callable[[Config], list[Transform]] = no_transforms
     training_transforms: Callable[[Config], list[Transform]] = no_transforms
     shield: Shield | None = None
-    shield: Shield | None = None
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""

@@ -135,7 +135,7 @@ class Config:
             if self.paper and value != own:
                 raise ValueError(f"{name} must be {own} with paper, got {value}.")
         if self.paper and "ppo-shield" in self.chosen:
-            raise ValueError("shield must be False with paper: its motors have no speed limits.")
+            raise ValueError("shield must be False with paper, whose environment has none.")
         for name in self.algorithms:
             if self.paper and name in OFF_POLICY:
                 raise ValueError(
