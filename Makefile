@@ -22,16 +22,19 @@ train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
 
 # One thread each: the processes have the cores to themselves. Tests of one file share its long runs.
+# Files keep their order: xdist would begin those with few tests last, some of which are long.
+PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
+
 test: $(READY)  ## everything but the slow tests, on two cores
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL) -m "not slow" $(ARGS)
 
 # The kernels that every processor has, in place of those that it is best at.
 test-kernels: $(READY)  ## the numerical tests once more, as another processor rounds
-	MKL_CBWR=COMPATIBLE ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 \
-		--dist loadfile -m "not slow" $(NUMERICAL) $(ARGS)
+	MKL_CBWR=COMPATIBLE ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL) \
+		-m "not slow" $(NUMERICAL) $(ARGS)
 
 test-slow: $(READY)  ## every combination, and the tests that train for minutes
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m slow $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL) -m slow $(ARGS)
 
 test-safety-gymnasium: $(SAFETY)/.ready  ## with Safety-Gymnasium itself, in an environment of its own
 	OMP_NUM_THREADS=1 $(SAFETY)/bin/pytest tests/with_safety_gymnasium $(ARGS)

@@ -33,7 +33,6 @@ from torchrl_safe.objectives import (
     P3OLoss,
     PIDControl,
     PPOLagrangianLoss,
-    RelativePID,
     SACLagrangianLoss,
     TD3LagrangianLoss,
     TrustRegionLoss,
@@ -43,16 +42,12 @@ from torchrl_safe.objectives import (
 )
 
 Updater = MultiplierUpdater | ViolationUpdater
-# Called as rule(loss, rate, cost_limit=, pessimism=). The gains stand to each other as in
-# tests/test_constrained_optimum.py.
+# Called as rule(loss, rate, cost_limit=, pessimism=).
 MULTIPLIER_RULES: dict[str, Callable[..., MultiplierUpdater]] = {
+    "pid": lambda loss, rate, **settings: PIDControl(loss, ki=rate, **settings),
     "dual-ascent": lambda loss, rate, **settings: DualAscent(
         loss, lr=rate, normalize=True, **settings
     ),
-    "pid": lambda loss, rate, **settings: PIDControl(
-        loss, kp=5 * rate, ki=rate, kd=5 * rate, smoothing=0.5, normalize=True, **settings
-    ),
-    "relative-pid": lambda loss, rate, **settings: RelativePID(loss, **settings),
 }
 
 
@@ -122,8 +117,7 @@ class OnPolicy:
     """An algorithm that learns from each batch while it is fresh.
 
     Args:
-        loss: called as ``loss(actor, critic, cost_critic, num_costs=)``, with a rule without
-            units also with ``normalize_cost_advantage=True``.
+        loss: called as ``loss(actor, critic, cost_critic, num_costs=)``.
         updater: called as ``updater(loss, config)``.
         epochs: passes over a batch, if not those of the configuration.
         method: the step that a trust-region method takes with the actor.
@@ -148,10 +142,8 @@ class OnPolicy:
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
         agent = make_agent(env, gamma=config.gamma, log_std=config.first_log_std)
-        options = {"num_costs": num_costs(env)}
-        if self.updater is move_multiplier and config.multiplier_rule == "relative-pid":
-            options["normalize_cost_advantage"] = True
-        loss = self.loss(agent.actor, agent.critic, agent.cost_critic, **options)
+        networks = agent.actor, agent.critic, agent.cost_critic
+        loss = self.loss(*networks, num_costs=num_costs(env))
         discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
         loss.make_value_estimator(ValueEstimators.GAE, **discount)
         loss.make_cost_value_estimator(**discount)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from pathlib import Path
 from time import strftime
 from typing import Literal
@@ -31,7 +32,7 @@ AlgorithmName = Literal[
     "td3-lagrangian",
 ]
 Engine = Literal["bullet", "mujoco"]
-MultiplierRule = Literal["dual-ascent", "pid", "relative-pid", "fixed"]
+MultiplierRule = Literal["pid", "dual-ascent", "fixed"]
 #: The algorithms that learn from replay; they need bounded actions.
 OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
 
@@ -66,6 +67,9 @@ class Config:
     workers: int | None = None
     """Processes that simulate; with 1 this process does. By default 2 with bullet, and 1 with
     mujoco, which has threads instead. Another number gives other episodes."""
+    jobs: int | None = None
+    """Algorithms that train side by side, each in a process. By default 1 with bullet, whose
+    simulation takes all cores, and one for each core with mujoco."""
     seed: int = 0
     """Seed of networks, environments and minibatches."""
     out: Path = dataclasses.field(
@@ -99,21 +103,20 @@ class Config:
     """The same at the end; it moves from one to the other linearly."""
     gamma: float = 0.97
     """Discount of reward and cost."""
-    multiplier_rule: MultiplierRule = "dual-ascent"
-    """What moves the multiplier: the violations added up, also the last one and its rise, these
-    without a unit (it needs no multiplier_rate), or nothing."""
+    multiplier_rule: MultiplierRule = "pid"
+    """What moves the multiplier: the violations added up and the last one (pid), those added up
+    alone, or nothing."""
     multiplier_init: float = 0.0
     """Multiplier to start with."""
-    multiplier_rate: float = 0.4
-    """Step size of the multiplier, once a batch, in units of the episode cost's standard
-    deviation; the integral gain of pid, whose other two gains are five times as large."""
+    multiplier_rate: float = 0.2
+    """What a batch far above its limit adds to the multiplier."""
     pessimism: float = 2.0
     """Standard errors added to the mean cost of a batch before it is compared with the limit; p3o,
     ipo and crpo do without."""
 
     def __post_init__(self) -> None:
-        counts = ("frames", "envs", "workers", "eval_episodes", "frames_per_batch", "epochs")
-        for name in (*counts, "minibatch", "checkpoint_every", "episode_steps"):
+        counts = ("frames", "envs", "workers", "jobs", "eval_episodes", "frames_per_batch")
+        for name in (*counts, "epochs", "minibatch", "checkpoint_every", "episode_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}.")
@@ -165,3 +168,10 @@ class Config:
         if self.workers is not None:
             return self.workers
         return 2 if self.physics == "bullet" else 1
+
+    @property
+    def side_by_side(self) -> int:
+        """Algorithms that train at a time: what ``jobs`` says, or what is fastest."""
+        if self.jobs is not None:
+            return self.jobs
+        return 1 if self.physics == "bullet" else os.cpu_count() or 1

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import multiprocessing
-from collections.abc import Callable, Mapping, Sequence
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,51 @@ from torchrl_safe.checkpoint import refuse_other_settings
 def missing(jobs: Mapping[Path, Any]) -> list[Path]:
     """The files of jobs that have not been run."""
     return [path for path in jobs if not path.exists()]
+
+
+def side_by_side(
+    run: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], *, workers: int
+) -> Iterator[tuple[int, Any]]:
+    """Calls ``run`` in processes that end with this one, whatever ends it.
+
+    Args:
+        run: called as ``run(*arguments[index])``.
+        arguments: the arguments of each call.
+        workers: processes side by side.
+
+    Yields:
+        Index and result of each call, in the order in which they end. After a call that fails no
+        other begins.
+    """
+    context = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
+    lock = context.RLock()
+    with ProcessPoolExecutor(workers, context, initializer=_prepare, initargs=(lock,)) as pool:
+        try:
+            running = {pool.submit(run, *each): index for index, each in enumerate(arguments)}
+            for done in as_completed(running):
+                yield running[done], done.result()
+        except Exception:
+            pool.shutdown(cancel_futures=True)
+            raise
+        except BaseException:  # Ctrl+C, which may have come to this process alone.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(multiprocessing.active_children()) - others:
+                process.terminate()
+            raise
+
+
+def _prepare(lock: Any) -> None:
+    """Lets progress bars take turns, and ends this process with its parent."""
+    tqdm.set_lock(lock)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def run_grid(
@@ -45,14 +92,10 @@ def run_grid(
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists():
             _check_same(path, jobs[path])
-    todo = missing(jobs)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context) as pool:
-        running = [pool.submit(_run_and_keep, run, path, jobs[path]) for path in todo]
-        for done in tqdm(as_completed(running), total=len(todo), desc=name, unit="run"):
-            if done.exception() is not None:
-                pool.shutdown(cancel_futures=True)
-                done.result()
+    todo = [(run, path, jobs[path]) for path in missing(jobs)]
+    done = side_by_side(_run_and_keep, todo, workers=workers)
+    for _ in tqdm(done, total=len(todo), desc=name, unit="run"):
+        pass
     return [json.loads(path.read_text())["result"] for path in jobs]
 
 

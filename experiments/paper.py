@@ -103,6 +103,7 @@ def make_agent(env: EnvBase) -> tuple[ProbabilisticActor, PPOLagrangianLoss]:
         ValueOperator(network(1), in_keys=["observation"], out_keys=["cost_value"]),
         entropy_bonus=False,
         loss_critic_type="l2",
+        normalize_cost_advantage=False,  # As in the paper, where multipliers have a unit.
     )
     loss.make_value_estimator(gamma=0.99, lmbda=0.97, vectorized=True)
     loss.make_cost_value_estimator(gamma=0.99, lmbda=0.97, vectorized=True)

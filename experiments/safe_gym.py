@@ -41,7 +41,7 @@ from torchrl_safe.envs.gym import SafeGymEnv
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.objectives import (
     MultiplierUpdater,
-    RelativePID,
+    PIDControl,
     TrustRegionStep,
     ViolationUpdater,
 )
@@ -310,7 +310,7 @@ def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | Violat
     if wanted is keep_multiplier:
         return None
     if wanted is move_multiplier:
-        return RelativePID(loss, cost_limit=limits)
+        return PIDControl(loss, cost_limit=limits)
     return ViolationUpdater(loss, cost_limit=limits)
 
 
@@ -331,10 +331,7 @@ class Learner:
         assert isinstance(algorithm, OnPolicy)
         self.config, self.agent = config, agent
         networks = agent.actor, agent.critic, agent.cost_critic
-        options: dict[str, Any] = {"num_costs": len(config.cost_keys)}
-        if algorithm.updater is move_multiplier:  # RelativePID's multiplier has no unit.
-            options["normalize_cost_advantage"] = True
-        self.loss = algorithm.loss(*networks, **options)
+        self.loss = algorithm.loss(*networks, num_costs=len(config.cost_keys))
         discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
         self.loss.make_value_estimator(ValueEstimators.GAE, **discount)
         self.loss.make_cost_value_estimator(**discount)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
@@ -27,6 +27,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, Training
 from experiments.config import AlgorithmName, Config
 from experiments.files import is_new, write_whole
+from experiments.grid import side_by_side
 from experiments.log import Log, figures, score, summed_costs, versions
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
@@ -70,7 +71,7 @@ PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": P
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
 COSTS = {"collision": Collision()}
 # What may be another when a run is resumed: it changes nothing in what is learnt.
-CHANGEABLE = ("algorithms", "out", "logger", "resume", "checkpoint_every")
+CHANGEABLE = ("algorithms", "shield", "jobs", "out", "logger", "resume", "checkpoint_every")
 
 
 def make_env(
@@ -150,9 +151,12 @@ def settings(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def train(
-    config: Config, algorithm: AlgorithmName, *, progress: bool = True
+    config: Config, algorithm: AlgorithmName, *, progress: bool = True, line: int = 0
 ) -> tuple[TensorDictModuleBase, Log]:
-    """Trains with one algorithm; returns the policy and the figures of each batch."""
+    """Trains with one algorithm; returns the policy and the figures of each batch.
+
+    ``line`` is where the progress is shown, below the first.
+    """
     # TorchRL's notes on each buffer would break up the progress bar.
     torchrl_logger.setLevel("WARNING")
     # The networks are small: more threads than one only wait for each other.
@@ -166,7 +170,12 @@ def train(
     with (
         collecting(config, training.collector, algorithm) as collector,
         tqdm(
-            total=config.frames, desc=algorithm, unit="frame", unit_scale=True, disable=not progress
+            total=config.frames,
+            desc=algorithm,
+            unit="frame",
+            unit_scale=True,
+            disable=not progress,
+            position=line,
         ) as bar,
     ):
         checkpoints = RunCheckpoints(
@@ -216,10 +225,10 @@ def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) ->
 
 
 def train_and_evaluate(
-    config: Config, algorithm: AlgorithmName, *, progress: bool = True
+    config: Config, algorithm: AlgorithmName, *, progress: bool = True, line: int = 0
 ) -> tuple[TensorDictModuleBase, dict[str, Any]]:
     """Trains with one algorithm and plays with what it has learnt; returns policy and results."""
-    actor, log = train(config, algorithm, progress=progress)
+    actor, log = train(config, algorithm, progress=progress, line=line)
     seconds = log.seconds
     env = make_env(config, num_envs=32, algorithm=algorithm)
     # Seeds that training does not use.
@@ -257,18 +266,41 @@ def start(config: Config) -> dict[str, Any]:
     return results
 
 
+def train_and_film(config: Config, algorithm: AlgorithmName, line: int = 0) -> dict[str, Any]:
+    """Trains, evaluates and films one algorithm; returns its results."""
+    actor, result = train_and_evaluate(config, algorithm, line=line)
+    stage = make_env(config, num_envs=1, seed=config.seed, algorithm=algorithm)
+    save_animation(stage, actor, config.out / algorithm / "policy.gif")
+    stage.close()
+    return result
+
+
+def finish(
+    config: Config, algorithms: Sequence[AlgorithmName]
+) -> Iterator[tuple[AlgorithmName, dict[str, Any]]]:
+    """Trains all algorithms; yields name and results of each as soon as it has ended."""
+    workers = min(config.side_by_side, len(algorithms))
+    if workers < 2:
+        for algorithm in algorithms:
+            yield algorithm, train_and_film(config, algorithm)
+        return
+    jobs = [(config, algorithm, line) for line, algorithm in enumerate(algorithms)]
+    for index, result in side_by_side(train_and_film, jobs, workers=workers):
+        yield algorithms[index], result
+
+
 def main(config: Config) -> None:
     """Trains and evaluates each algorithm, then writes the comparison."""
     results = start(config)
-    for algorithm in config.chosen:
-        if algorithm in results["algorithms"]:
-            continue
-        actor, results["algorithms"][algorithm] = train_and_evaluate(config, algorithm)
-        stage = make_env(config, num_envs=1, seed=config.seed, algorithm=algorithm)
-        save_picture(stage, config.out / "scene.png")
-        save_animation(stage, actor, config.out / algorithm / "policy.gif")
-        stage.close()
+    todo = [name for name in config.chosen if name not in results["algorithms"]]
+    for algorithm, result in finish(config, todo):
+        done = {**results["algorithms"], algorithm: result}
+        # In one order, whichever ends first.
+        results["algorithms"] = {n: done[n] for n in (*config.chosen, *done) if n in done}
         write_whole(config.out / "results.json", json.dumps(results, indent=1, default=str))
+    stage = make_env(config, num_envs=1, seed=config.seed, algorithm=config.chosen[0])
+    save_picture(stage, config.out / "scene.png")
+    stage.close()
     plot_curves(results, config.out / "curves.png")
     text = table(results)
     (config.out / "table.md").write_text(text)

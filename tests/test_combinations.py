@@ -76,7 +76,7 @@ def play(env, actions, disturb=()):
 
 @pytest.mark.parametrize(
     ("arm", "action", "task", "obstacles", "physics"),
-    combinations(ARMS, ACTIONS, TASKS, OBSTACLES, ENGINES, every=5),
+    combinations(ARMS, ACTIONS, TASKS, OBSTACLES, ENGINES),
 )
 def test_combination(make_env, arm, action, task, obstacles, physics):
     """Specs; finite values; a seed is a rollout, bit for bit; resets are worlds' own affairs."""

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch
-from test_resume import SETTINGS, assert_goes_on_bit_for_bit
+from test_resume import SETTINGS, assert_goes_on_bit_for_bit, may_leave_a_file_open
 from test_train import make_training
 
 from experiments import compiling
@@ -55,6 +55,7 @@ def test_trains_compiled(algorithm, tmp_path, always):
     assert [row["frames"] for row in log.rows] == [80, 160]
 
 
+@may_leave_a_file_open
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile wants a C++ compiler")
 def test_a_compiled_run_goes_on_bit_for_bit(tmp_path, always):

@@ -31,9 +31,19 @@ LIMIT = ConstrainedBandit.optimal_probability
 
 # A_r - lambda A_c vanishes here at p = LIMIT.
 MULTIPLIER = 1 / math.sqrt(LIMIT * (1 - LIMIT))
+IN_UNITS = {"normalize_cost_advantage": False}
 SHARPNESS = 5.0
 
-pid = partial(PIDControl, kp=5.0, ki=1.0, kd=5.0, smoothing=0.5)
+pid = partial(
+    PIDControl,
+    kp=5.0,
+    ki=1.0,
+    kd=5.0,
+    smoothing=0.5,
+    max_multiplier=None,
+    pessimism=0.0,
+    normalize=False,
+)
 
 
 def wrapping(make, parent):
@@ -68,11 +78,11 @@ def violation(loss):
 
 NO_BONUS = {"entropy_bonus": False}
 LAGRANGIAN = {
-    "a2c": wrapping(LagrangianLoss, partial(A2CLoss, **NO_BONUS)),
-    "reinforce": wrapping(LagrangianLoss, ReinforceLoss),
-    "clip-ppo": wrapping(LagrangianLoss, partial(ClipPPOLoss, **NO_BONUS)),
-    "kl-ppo": wrapping(LagrangianLoss, partial(KLPENPPOLoss, **NO_BONUS)),
-    "focops": of_one_step(FOCOPSLoss),
+    "a2c": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(A2CLoss, **NO_BONUS)),
+    "reinforce": wrapping(partial(LagrangianLoss, **IN_UNITS), ReinforceLoss),
+    "clip-ppo": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(ClipPPOLoss, **NO_BONUS)),
+    "kl-ppo": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(KLPENPPOLoss, **NO_BONUS)),
+    "focops": of_one_step(FOCOPSLoss, **IN_UNITS),
 }
 CRPO = {
     "a2c": wrapping(CRPOLoss, partial(A2CLoss, **NO_BONUS)),
@@ -99,7 +109,9 @@ def test_lagrangian_losses_reach_the_optimum_and_its_multipliers(make):
 
 def test_cup_reaches_the_optimum():
     make = of_one_step(CUPLoss, multiplier_init=1.0)
-    rule = partial(PIDControl, kp=5.0, ki=0.5, kd=0.0)
+    rule = partial(
+        PIDControl, kp=5.0, ki=0.5, kd=0.0, max_multiplier=None, pessimism=0.0, normalize=False
+    )
     outcome = train_on_bandit(make, rule, num_batches=50, learn=learn_in_two_phases)
     share, multiplier = last(outcome, 30)
     assert share.item() == pytest.approx(LIMIT, abs=0.01)
@@ -159,7 +171,7 @@ def test_the_optimum_is_the_same_for_ppo_lagrangian_to_the_bit():
     wrapped = LAGRANGIAN["clip-ppo"]
     outcomes = [
         train_on_bandit(make, partial(DualAscent, lr=1.0), num_batches=10)
-        for make in (wrapped, partial(PPOLagrangianLoss, **NO_BONUS))
+        for make in (wrapped, partial(PPOLagrangianLoss, **NO_BONUS, **IN_UNITS))
     ]
     for ours, theirs in zip(*outcomes, strict=True):
         assert torch.equal(ours, theirs)

@@ -570,7 +570,13 @@ def test_cup_keeps_the_improved_policy_in_its_state():
 
 @pytest.mark.parametrize("make", [FOCOPSLoss, CUPLoss])
 @pytest.mark.parametrize(
-    "rule", [partial(DualAscent, lr=1.0), partial(PIDControl, kp=1.0, ki=1.0, kd=1.0)]
+    "rule",
+    [
+        partial(DualAscent, lr=1.0),
+        partial(
+            PIDControl, kp=1.0, ki=1.0, kd=1.0, max_multiplier=None, pessimism=0.0, normalize=False
+        ),
+    ],
 )
 def test_every_rule_moves_the_multiplier(make, rule):
     loss = build(make, 2, multiplier_init=0.5)

@@ -304,7 +304,6 @@ UPDATERS = [
     for kind in (
         objectives.DualAscent,
         objectives.PIDControl,
-        objectives.RelativePID,
         objectives.ViolationUpdater,
     )
 ]

@@ -4,11 +4,14 @@ import dataclasses
 import json
 import multiprocessing
 import os
+import signal
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
-from experiments.grid import missing, run_grid, save_results
+from experiments.grid import missing, run_grid, save_results, side_by_side
 
 
 @pytest.fixture(autouse=True)
@@ -46,6 +49,55 @@ def test_a_job_that_fails_leaves_the_others(tmp_path):
     assert [path.name for path in (tmp_path / "results").iterdir()] == ["2.json"]
     kept = json.loads((tmp_path / "results" / "2.json").read_text())
     assert kept["result"] == {"square": 4}
+
+
+def sleep(folder, number):
+    (folder / f"{number}-{os.getpid()}").touch()
+    time.sleep(600)
+
+
+def sleep_side_by_side(folder):
+    for _ in side_by_side(sleep, [(folder, 0), (folder, 1)], workers=2):
+        pass
+
+
+def sleepers(folder):
+    """The two processes, once both are there."""
+    while len(found := list(folder.iterdir())) < 2:
+        time.sleep(0.01)
+    return [int(path.name.split("-")[1]) for path in found]
+
+
+def assert_gone(processes):
+    for _ in range(1000):
+        if not any(Path(f"/proc/{process}").exists() for process in processes):
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"still running: {processes}")
+
+
+def test_an_interrupt_of_this_process_alone_ends_all(tmp_path):
+    def interrupt():
+        sleepers(tmp_path)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        sleep_side_by_side(tmp_path)
+    thread.join()
+    assert_gone(sleepers(tmp_path))
+
+
+def test_none_is_left_when_this_process_is_killed(tmp_path):
+    process = multiprocessing.get_context("fork").Process(
+        target=sleep_side_by_side, args=(tmp_path,)
+    )
+    process.start()
+    running = sleepers(tmp_path)
+    process.kill()
+    process.join()
+    assert_gone(running)
 
 
 @dataclasses.dataclass(frozen=True)

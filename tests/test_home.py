@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import each_arm
+from worlds import ENGINES, each_arm
 
 from torchrl_safe.envs import PANDA, UR5, XARM6, ArmEnv, Bullet, NoObstacles, Scene, find_home
+from torchrl_safe.envs.kinematics import approach, distance_to_reach
 
 DOWN = (1.0, 0.0, 0.0, 0.0)
 
@@ -42,6 +43,27 @@ def test_a_guess_becomes_a_home(make_env, arm):
 def test_home_is_its_own_home(arm):
     position, orientation, _ = pose_of(arm, arm.home)
     np.testing.assert_allclose(find_home(arm, position, orientation), arm.home, atol=1e-4)
+
+
+@pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
+def test_searches_side_by_side_are_those_of_each_alone(physics):
+    """Also where some arrive before others, and one never does."""
+    simulator = physics.build(PANDA, Scene(), num_envs=1)
+    position, orientation = simulator.home_position, simulator.home_orientation
+    moves = np.array([[0, 0, 0], [0.1, -0.2, 0.1], [0.2, 0.3, 0.2], [2, 0, 0]])
+    starts = np.tile(PANDA.home, (4, 1))
+    poses = position + moves, np.tile(orientation, (4, 1))
+    together = approach(simulator, starts, *poses)
+    assert (together.distance < 1e-5).tolist() == [True, True, True, False]
+    for row in range(4):
+        alone = approach(simulator, *(part[row : row + 1] for part in (starts, *poses)))
+        assert alone.distance[0] == pytest.approx(together.distance[row], abs=1e-4)
+        if row < 3:
+            np.testing.assert_allclose(alone.angles[0], together.angles[row], atol=1e-6)
+    misses = distance_to_reach(simulator, PANDA.home, poses[0])
+    simulator.close()
+    assert misses[:3].tolist() == [0, 0, 0]
+    assert misses[3] > 1.0
 
 
 @each_arm

@@ -150,7 +150,9 @@ RULES = {
     "softplus-adam": partial(
         DualAscent, lr=0.1, optimizer=torch.optim.Adam, parametrization=SoftplusTransform()
     ),
-    "pid": partial(PIDControl, kp=1.0, ki=1.0, kd=1.0),
+    "pid": partial(
+        PIDControl, kp=1.0, ki=1.0, kd=1.0, max_multiplier=None, pessimism=0.0, normalize=False
+    ),
 }
 
 

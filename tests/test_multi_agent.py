@@ -98,7 +98,7 @@ def make_batch():
 
 
 def test_advantages_are_those_of_each_agent_alone():
-    loss, batch = make_loss(), make_batch()
+    loss, batch = make_loss(normalize_cost_advantage=False), make_batch()
     loss.estimate_advantages(batch)
     # The same agent in a batch without others, whose values are known.
     values = batch["agents", "cost_value"], batch["next", "agents", "cost_value"]

@@ -140,63 +140,64 @@ def test_pessimism_adds_nothing_to_a_single_episode():
     ("costs", "limit", "pessimism", "expected"),
     [
         # Mean 2 of standard deviation sqrt 8.
-        pytest.param([0.0, 4.0], 1.0, 0.0, 1 / (2 * math.sqrt(8)), id="mean-and-deviation"),
-        pytest.param([0.0, 4.0], 1.0, 1.0, 3 / (2 * math.sqrt(8)), id="pessimistic"),
-        pytest.param([1.0, 1.0], 2.0, 0.0, -1 / (2 * 2), id="limit-for-both"),
-        pytest.param([4.0], 1.0, 0.0, 3 / (4 * 4), id="one-episode"),
-        pytest.param([3.0, 3.0], 0.0, 0.0, 3 / (3 * 3), id="limit-zero-no-deviation"),
-        pytest.param([3.0, 3.000001], 0.0, 0.0, 3 / (3 * 3), id="limit-zero-little-deviation"),
+        pytest.param([0.0, 4.0], 1.0, 0.0, 1 / math.sqrt(8), id="deviation"),
+        pytest.param([0.0, 4.0], 1.0, 0.5, 2 / math.sqrt(8), id="pessimistic"),
+        pytest.param([9.0, 9.0], 10.0, 0.0, -1 / 2, id="a-fifth-of-the-limit"),
+        pytest.param([11.0], 10.0, 0.0, 1 / 2, id="one-episode"),
+        pytest.param([200.0, 200.0], 10.0, 0.0, 1.0, id="far-above"),
+        pytest.param([0.0, 0.0], 10.0, 0.0, -1.0, id="far-below"),
+        pytest.param([3.0, 3.0], 0.0, 0.0, 1.0, id="limit-zero-no-deviation"),
         pytest.param([0.0, 0.0], 0.0, 2.0, 0.0, id="nothing-at-all"),
     ],
 )
-def test_normalized_violation(costs, limit, pessimism, expected):
+def test_relative_violation(costs, limit, pessimism, expected):
     module = make_module(5.0)
     updater = DualAscent(module, cost_limit=limit, lr=1.0, pessimism=pessimism, normalize=True)
     updater.step(torch.tensor(costs).unsqueeze(-1))
     torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([5.0 + expected]))
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3, 1e6])
 @pytest.mark.parametrize(
-    "rule", [partial(DualAscent, lr=0.5), partial(PIDControl, kp=1, ki=1, kd=1)]
+    "rule", [partial(DualAscent, lr=0.5, pessimism=1.0, normalize=True), partial(PIDControl, kd=1)]
 )
-def test_normalized_multipliers_follow_the_unit_of_the_cost(rule):
-    """Grams for kilograms: every multiplier is a thousandth, after every step."""
+def test_costs_in_another_unit_move_the_same_multipliers(rule, unit):
     generator = torch.Generator().manual_seed(0)
-    kilograms, grams = make_module(0.0), make_module(0.0)
-    rules = [
-        rule(module, cost_limit=limit, pessimism=1.0, normalize=True)
-        for module, limit in ((kilograms, 2.0), (grams, 2000.0))
-    ]
-    for scale in (8.0, 9.0, 1.0, 0.5, 10.0):
+    plain, other = make_module(0.0), make_module(0.0)
+    rules = rule(plain, cost_limit=2.0), rule(other, cost_limit=2.0 * unit)
+    seen = []
+    for scale in (50.0, 8.0, 1.0, 3.0, 0.0, 5.0):
         costs = scale * torch.rand(6, 1, generator=generator)
         rules[0].step(costs)
-        rules[1].step(1000 * costs)
-        torch.testing.assert_close(1000 * grams.lagrange_multiplier, kilograms.lagrange_multiplier)
-    assert kilograms.lagrange_multiplier.item() > 0
+        rules[1].step(unit * costs)
+        torch.testing.assert_close(other.lagrange_multiplier, plain.lagrange_multiplier)
+        seen.append(plain.lagrange_multiplier.item())
+    assert max(seen) > 0.5
 
 
 def test_integer_costs_are_normalized_as_numbers():
     module = make_module(0.0)
-    updater = DualAscent(module, cost_limit=0.5, lr=1.0, normalize=True)
-    updater.step(torch.tensor([[1], [1]]))
+    updater = DualAscent(module, cost_limit=5.0, lr=1.0, normalize=True)
+    updater.step(torch.tensor([[5], [6]]))
     torch.testing.assert_close(module.lagrange_multiplier, torch.tensor([0.5]))
     torch.testing.assert_close(updater.cost_scale, torch.tensor([1.0]))
 
 
-def test_violations_are_normalized_by_the_batches_before():
-    # By the largest so far, 2 * 2, then 4 * 4; then by 0.9 times 16 and 0.1 times 1 * 1.
+def test_violations_are_divided_by_the_largest_deviation_so_far():
+    # Deviations sqrt 8, sqrt 32, 0, 0: the last counts by 0.8 sqrt 32 and a fifth of 2.
     module = make_module(0.0)
-    updater = DualAscent(module, cost_limit=0.0, lr=1.0, normalize=True)
+    updater = DualAscent(module, cost_limit=10.0, lr=1.0, normalize=True)
     seen = []
-    for cost in (2.0, 4.0, 1.0, 1.0):
-        updater.step(torch.tensor([[cost], [cost]]))
+    for low, high in ((9.0, 13.0), (7.0, 15.0), (11.0, 11.0), (11.0, 11.0)):
+        updater.step(torch.tensor([[low], [high]]))
         seen.append(module.lagrange_multiplier.item())
-    steps = [2 / 4, 4 / 16, 1 / 16, 1 / (0.9 * 16 + 0.1 * 1)]
+    widest = math.sqrt(32)
+    steps = [1 / math.sqrt(8), 1 / widest, 1 / widest, 1 / (0.8 * widest + 0.2 * 2)]
     assert seen == pytest.approx(list(itertools.accumulate(steps)))
     other = DualAscent(make_module(seen[-1]), cost_limit=0.0, lr=1.0)
     other.load_state_dict(updater.state_dict())
     for each in (updater, other):
-        each.step(torch.tensor([[3.0]]))
+        each.step(torch.tensor([[13.0]]))
     assert torch.equal(other.loss_module.lagrange_multiplier, module.lagrange_multiplier)
 
 
@@ -302,7 +303,7 @@ def test_bad_arguments_are_named(name, value):
 NAMED = {"collision": 0.5, "speed": 2.0}
 RULES = {
     "dual": partial(DualAscent, lr=0.1),
-    "pid": partial(PIDControl, kp=1.0, ki=0.1, kd=0.0),
+    "pid": partial(PIDControl, pessimism=0.0),
 }
 every_rule = pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
 

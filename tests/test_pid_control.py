@@ -30,9 +30,14 @@ def follow(updater, *mean_costs):
     return torch.stack(history).squeeze(-1).tolist()
 
 
+# In the unit of the cost, as published.
+PUBLISHED = {"max_multiplier": None, "pessimism": 0.0, "normalize": False}
+
+
 def make(*multiplier, kp=0.0, ki=0.0, kd=0.0, cost_limit=10.0, **kwargs):
     module = make_module(*(multiplier or (0.0,)))
-    return PIDControl(module, cost_limit=cost_limit, kp=kp, ki=ki, kd=kd, **kwargs)
+    settings = {**PUBLISHED, **kwargs}
+    return PIDControl(module, cost_limit=cost_limit, kp=kp, ki=ki, kd=kd, **settings)
 
 
 # ---------------------------------------------------------------- each term alone
@@ -121,7 +126,7 @@ def test_the_integral_alone_is_dual_ascent_bit_for_bit(costs, smoothing, bound, 
     torch.manual_seed(costs)
     start, limit = torch.rand(costs), 1.5 + 0.5 * torch.rand(costs)
     modules = [make_module(*start.tolist()) for _ in range(2)]
-    settings = {"cost_limit": limit, "max_multiplier": bound}
+    settings = {**PUBLISHED, "cost_limit": limit, "max_multiplier": bound}
     ascent = DualAscent(modules[0], lr=lr, **settings)
     control = PIDControl(modules[1], kp=0.0, ki=lr, kd=0.0, smoothing=smoothing, **settings)
     seen = []
@@ -143,7 +148,7 @@ def test_the_integral_alone_is_dual_ascent_bit_for_bit(costs, smoothing, bound, 
 def test_the_update_is_in_place():
     loss = make_loss(num_costs=2)
     address = loss.lagrange_multiplier.data_ptr()
-    follow(PIDControl(loss, cost_limit=0.0, kp=1.0, ki=1.0, kd=1.0), [1.0, 2.0])
+    follow(PIDControl(loss, cost_limit=0.0, kp=1.0, ki=1.0, kd=1.0, **PUBLISHED), [1.0, 2.0])
     assert loss.lagrange_multiplier.data_ptr() == address
     assert loss.lagrange_multiplier.tolist() == [2, 4]
 

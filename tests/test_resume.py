@@ -1,5 +1,6 @@
 """A run that is stopped at any point and resumed is the run that never was, bit for bit."""
 
+import gc
 import json
 import os
 import shutil
@@ -65,21 +66,24 @@ def make_train(out, *algorithms, **settings):
     )
 
 
-def wait_for(process, happens):
+def wait_for(process, happens, every=0.001):
     deadline = time.monotonic() + 600
     while not happens():
         if process.poll() is not None:
             pytest.fail(f"ended with {process.returncode}: {process.stderr.read()[-3000:]}")
         assert time.monotonic() < deadline
-        time.sleep(0.001)
+        time.sleep(every)
 
 
 def kill_in_the_middle_of_a_write(process, folder):
     unfinished = folder / ".unfinished"
+    # Not at the first: there is nothing to go on from.
+    wait_for(process, lambda: any(folder.glob("*.torchrl")), every=0.02)
     while True:
-        # Not at the first: there is nothing to go on from.
-        wait_for(process, lambda: any(folder.glob("*.torchrl")) and unfinished.exists())
+        wait_for(process, unfinished.exists)
         process.send_signal(signal.SIGSTOP)
+        # It does not stop at once.
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
         left = list(unfinished.rglob("*.pt")) if unfinished.exists() else []
         if left:
             process.kill()
@@ -139,6 +143,11 @@ def interrupt_when(happens):
     return thread
 
 
+# An interrupt may come between open() and the "with" that closes the file: then Python closes it,
+# and warns.
+may_leave_a_file_open = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+
+
 def assert_goes_on_bit_for_bit(algorithm, tmp_path):
     """Stopped after its second checkpoint, a run ends as one that was never stopped."""
     settings = {**SETTINGS, "frames": 320}
@@ -149,10 +158,12 @@ def assert_goes_on_bit_for_bit(algorithm, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(Config(**settings, out=two), algorithm, progress=False)
     thread.join()
+    gc.collect()  # What was left open is closed now, while that may be.
     resumed = train(Config(**settings, out=two, resume=True), algorithm, progress=False)
     assert_same_run(expected, resumed, one, two)
 
 
+@may_leave_a_file_open
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_algorithm_goes_on_bit_for_bit(algorithm, tmp_path):
@@ -168,12 +179,12 @@ def results(out):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-def test_stopped_again_and_again(tmp_path, workers, start):
+@pytest.mark.parametrize(("workers", "jobs"), [(1, 1), (2, 1), (1, 2)])
+def test_stopped_again_and_again(tmp_path, workers, jobs, start):
     """By all signals, in training and after it; what was finished stays, the rest is the same."""
     one, two = tmp_path / "one", tmp_path / "two"
     names = ("ppo", "sac-lagrangian")
-    process = start(one, *names, workers=workers)
+    process = start(one, *names, workers=workers, jobs=1)
     _, problem = process.communicate()
     assert process.returncode == 0, problem
 
@@ -189,14 +200,14 @@ def test_stopped_again_and_again(tmp_path, workers, start):
         (signal.SIGINT, reaches("sac-lagrangian", 256)),
     )
     for number, happens in stops:
-        process = start(two, *names, workers=workers)
+        process = start(two, *names, workers=workers, jobs=jobs)
         wait_for(process, happens)
         children = children_of(process.pid)
         process.send_signal(number)
         process.communicate()
         assert process.returncode != 0
         wait_until_gone(children)
-    process = start(two, *names, workers=workers)
+    process = start(two, *names, workers=workers, jobs=jobs)
     _, problem = process.communicate()
     assert process.returncode == 0, problem
     assert results(one) == results(two)

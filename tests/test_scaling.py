@@ -18,8 +18,8 @@ from torchrl_safe.objectives import (
     IPOLoss,
     LagrangianLoss,
     P3OLoss,
+    PIDControl,
     PPOLagrangianLoss,
-    RelativePID,
     TrustRegionLoss,
     TrustRegionStep,
     cost_advantage_scale,
@@ -75,7 +75,7 @@ def test_a_cost_without_advantage_stays_zero():
 
 
 def test_estimated_advantages_are_divided_by_the_scale_that_the_loss_keeps():
-    loss, plain = make_loss(2, normalize_cost_advantage=True), make_loss(2)
+    loss, plain = make_loss(2), make_loss(2, normalize_cost_advantage=False)
     batch = loss.estimate_advantages(make_batch(2))
     advantage = batch["cost_advantage"].flatten(0, 1)
     torch.testing.assert_close(advantage.std(0), torch.ones(2))
@@ -93,23 +93,23 @@ def test_estimated_advantages_are_divided_by_the_scale_that_the_loss_keeps():
 
 
 def test_a_loss_without_advantages_scales_them_too():
-    loss = make_loss(2, multiplier_init=1.0, normalize_cost_advantage=True)
-    twin = make_loss(2, multiplier_init=1.0, normalize_cost_advantage=True)
+    loss = make_loss(2, multiplier_init=1.0)
+    twin = make_loss(2, multiplier_init=1.0)
     estimated = twin(twin.estimate_advantages(make_batch(2)))
     torch.testing.assert_close(loss(make_batch(2))["loss_objective"], estimated["loss_objective"])
     assert torch.equal(loss.cost_advantage_scale, twin.cost_advantage_scale)
 
 
 def test_the_scale_is_part_of_the_state():
-    loss = make_loss(2, normalize_cost_advantage=True)
+    loss = make_loss(2)
     loss.estimate_advantages(make_batch(2))
-    restored = make_loss(2, seed=3, normalize_cost_advantage=True)
+    restored = make_loss(2, seed=3)
     restored.load_state_dict(copy.deepcopy(loss.state_dict()))
     fewer = make_batch(2)
     fewer["next", "cost"] *= 0.1
     expected = loss.estimate_advantages(fewer.clone())["cost_advantage"]
     assert torch.equal(restored.estimate_advantages(fewer.clone())["cost_advantage"], expected)
-    assert "cost_advantage_scale" not in make_loss(2).state_dict()
+    assert "cost_advantage_scale" not in make_loss(2, normalize_cost_advantage=False).state_dict()
 
 
 def test_a_wrapped_loss_does_the_same():
@@ -119,9 +119,8 @@ def test_a_wrapped_loss_does_the_same():
         cost_critic,
         num_costs=2,
         multiplier_init=0.7,
-        normalize_cost_advantage=True,
     )
-    loss = make_loss(2, multiplier_init=0.7, normalize_cost_advantage=True, entropy_bonus=False)
+    loss = make_loss(2, multiplier_init=0.7, entropy_bonus=False)
     ours, theirs = (each(make_batch(2))["loss_objective"] for each in (wrapped, loss))
     assert torch.equal(ours, theirs)
 
@@ -210,9 +209,8 @@ def train(reward_unit=1.0, cost_unit=(1.0, 1.0), batches=60):
         num_costs=2,
         entropy_bonus=False,
         loss_critic_type="l2",
-        normalize_cost_advantage=True,
     )
-    updater = RelativePID(loss, cost_limit=torch.tensor([0.8, 3.0]) * corridor.cost_unit)
+    updater = PIDControl(loss, cost_limit=torch.tensor([0.8, 3.0]) * corridor.cost_unit)
     optimizer = torch.optim.SGD(loss.parameters(), lr=0.5)
     rows = []
     for _ in range(batches):

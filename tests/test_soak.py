@@ -154,13 +154,13 @@ def test_multipliers_stay_finite(rule, cost, limit, batches):
 @pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("rule", ["sgd", "exp", "pid"])
 def test_bounded_multipliers_come_back_from_extreme_costs(rule, normalize):
-    """The scale of normalized violations forgets a tenth in each batch: 1e12 in some 300."""
+    """The scale of normalized violations forgets a fifth in each batch: 1e6 in some 60."""
     settings = {"cost_limit": 1.0, "normalize": normalize, "max_multiplier": 10.0}
     updater, multiplier = make_updater(partial(RULES[rule], **settings))
     for _ in range(50):
         updater.step(make_episodes(1e6))
     reached = multiplier.item()
-    for _ in range(450):
+    for _ in range(200):
         updater.step(torch.zeros(8, 1))
     assert 0 <= multiplier.item() < min(reached, 1.0)
 
@@ -171,8 +171,8 @@ def test_one_absurd_cost_does_not_stop_a_normalized_multiplier(rule):
     updater, multiplier = make_updater(rule, cost_limit=1.0, normalize=True)
     updater.step(torch.tensor([[3e20]]))
     assert updater.cost_scale.isfinite()
-    # The scale forgets a tenth in each batch: it is back at 4, the square of 2, after 850.
-    for _ in range(900):
+    # The scale forgets a fifth in each batch: it is back at 2 after some 210.
+    for _ in range(300):
         before = multiplier.clone()
         updater.step(torch.tensor([[2.0]]))
     assert multiplier > before or multiplier == updater.max_multiplier

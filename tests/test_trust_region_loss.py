@@ -74,7 +74,9 @@ def test_every_multiplier_rule_and_the_violation_rule_move_it(rule):
     loss = make_loss(3)
     updater = {
         "dual-ascent": lambda: DualAscent(loss, cost_limit=1.0, lr=0.5),
-        "pid": lambda: PIDControl(loss, cost_limit=1.0, kp=0.25, ki=0.25, kd=0.0),
+        "pid": lambda: PIDControl(
+            loss, cost_limit=1.0, kp=0.25, ki=0.25, pessimism=0.0, normalize=False
+        ),
     }[rule]()
     episode_cost = torch.tensor([[3.0, 1.0, 0.0]])
     updater.step(episode_cost)

@@ -70,8 +70,18 @@ def test_trpo_lagrangian_reaches_the_optimum_and_its_multiplier():
     # A multiplier rule sees steps of one length only, to either side: it circles for long if it
     # starts far away. From 2 and nearby, 60 to 120 batches are enough.
     start = torch.tensor([2.0, 0.0])
-    rule = partial(PIDControl, kp=10.0, ki=1.0, kd=0.0, smoothing=0.5)
-    shares, multipliers, counts = run(TRPO(), rule, num_costs=2, batches=60, multiplier_init=start)
+    rule = partial(
+        PIDControl,
+        kp=10.0,
+        ki=1.0,
+        kd=0.0,
+        smoothing=0.5,
+        max_multiplier=None,
+        pessimism=0.0,
+        normalize=False,
+    )
+    settings = {"multiplier_init": start, "normalize_cost_advantage": False}
+    shares, multipliers, counts = run(TRPO(), rule, num_costs=2, batches=60, **settings)
     assert shares[-30:].mean().item() == pytest.approx(LIMIT, abs=0.015)
     best = 1 / math.sqrt(LIMIT * (1 - LIMIT))
     assert multipliers[-30:, 0].mean().item() == pytest.approx(best, abs=0.1)
@@ -132,7 +142,16 @@ def test_three_actions_end_in_the_best_mixture(method):
 
 
 def test_trpo_lagrangian_ends_in_the_best_mixture():
-    rule = partial(PIDControl, kp=20.0, ki=2.0, kd=0.0, smoothing=0.5)
+    rule = partial(
+        PIDControl,
+        kp=20.0,
+        ki=2.0,
+        kd=0.0,
+        smoothing=0.5,
+        max_multiplier=None,
+        pessimism=0.0,
+        normalize=False,
+    )
     shares = run_three_actions(TRPO(), rule, batches=60, multiplier_init=3.0)[-25:].mean(0)
     # Over five seeds it stayed within 0.043, and the median was 0.01 from the best mixture.
     torch.testing.assert_close(shares, torch.tensor([0.125, 0.875, 0.0]), rtol=0, atol=0.02)

@@ -256,7 +256,8 @@ def test_every_multiplier_rule_changes_the_step(num_costs):
     plain = stepped(None)
     dual = stepped(lambda loss: DualAscent(loss, cost_limit=1.0, lr=0.5))
     # Both rules give the multiplier 1: 0.5 * 2 and 0.25 * 2 + 0.25 * 2.
-    pid = stepped(lambda loss: PIDControl(loss, cost_limit=1.0, kp=0.25, ki=0.25, kd=0.0))
+    settings = {"kp": 0.25, "ki": 0.25, "pessimism": 0.0, "normalize": False}
+    pid = stepped(lambda loss: PIDControl(loss, cost_limit=1.0, **settings))
     assert torch.equal(dual, pid)
     assert not torch.equal(dual, plain)
 

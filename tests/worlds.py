@@ -27,17 +27,27 @@ ENGINES = {"bullet": Bullet(), "mujoco": MuJoCo(threads=1)}
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
 
 
-def combinations(*choices, every=3):
-    """All combinations as parameters; one in `every`, with every pair in it, is not slow."""
-    names = [list(choice) for choice in choices]
+def combinations(*choices):
+    """All combinations as parameters; each pair of choices is in one that is not slow."""
+    names = list(itertools.product(*choices))
+    fast = set(_with_every_pair(names))
     return [
-        pytest.param(
-            *(choice[index] for choice, index in zip(names, indices, strict=True)),
-            id="-".join(choice[index] for choice, index in zip(names, indices, strict=True)),
-            marks=[pytest.mark.slow] if sum(indices) % every else [],
-        )
-        for indices in itertools.product(*(range(len(choice)) for choice in names))
+        pytest.param(*one, id="-".join(one), marks=[] if one in fast else [pytest.mark.slow])
+        for one in names
     ]
+
+
+def _with_every_pair(combinations):
+    """Takes the combination with most pairs that are still missing, until none is."""
+
+    def pairs(combination):
+        return set(itertools.combinations(enumerate(combination), 2))
+
+    missing = set().union(*map(pairs, combinations))
+    while missing:
+        chosen = max(combinations, key=lambda one: len(pairs(one) & missing))
+        missing -= pairs(chosen)
+        yield chosen
 
 
 each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())

@@ -5,7 +5,7 @@ A safe policy for a robot arm, in plain TorchRL
 A robot arm is to reach a target that stands behind an obstacle. The shortest way leads through
 the obstacle, so an agent that looks at the reward alone learns to hit it. This tutorial trains an
 agent that may do so only so often, with :class:`~torchrl_safe.objectives.PPOLagrangianLoss` and
-:class:`~torchrl_safe.objectives.DualAscent`, in a training loop that you own: everything else is
+:class:`~torchrl_safe.objectives.PIDControl`, in a training loop that you own: everything else is
 TorchRL's.
 
 The problem is a constrained Markov decision process: maximize the expected return while the
@@ -37,7 +37,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_safe.envs import PANDA, ArmEnv, CartesianDelta, Collision, InFront, Reach
-from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
+from torchrl_safe.objectives import PIDControl, PPOLagrangianLoss
 
 TOTAL_FRAMES = 4_096
 FRAMES_PER_BATCH = 1_024
@@ -104,13 +104,13 @@ cost_critic = ValueOperator(mlp(1), in_keys=["observation"], out_keys=["cost_val
 #
 # The loss is PPO's clipped loss on the mixed advantage
 # :math:`(A_r - \lambda A_c) / (1 + \lambda)`. The multiplier :math:`\lambda` is a buffer of the
-# loss, which no optimizer touches. ``DualAscent`` moves it once for each batch, in proportion to
-# how far the cost of the episodes that ended is from the limit.
+# loss, which no optimizer touches. ``PIDControl`` moves it once for each batch, by how far the
+# cost of the episodes that ended is from the limit.
 
 loss = PPOLagrangianLoss(actor, critic, cost_critic, entropy_bonus=False)
 loss.make_value_estimator(gamma=0.97, lmbda=0.95)
 loss.make_cost_value_estimator(gamma=0.97, lmbda=0.95)
-updater = DualAscent(loss, cost_limit=COST_LIMIT, lr=0.2)
+updater = PIDControl(loss, cost_limit=COST_LIMIT)
 optimizer = torch.optim.Adam(loss.parameters(), lr=5e-4)
 
 # %%

@@ -71,7 +71,7 @@ def find_home(
     simulator = physics.build(arm, Scene(), num_envs=1)
     try:
         found, free = (
-            approach(simulator, arm.home, point, turned, respect_limits=limits)
+            _search(simulator, arm.home, (point, turned), respect_limits=limits)
             for limits in (True, False)
         )
         for end in (found, free):
@@ -87,8 +87,17 @@ def find_home(
         simulator.close()
 
 
+def _search(
+    simulator: Simulator, home: Sequence[float], pose: tuple[Array, Array], *, respect_limits: bool
+) -> Approach:
+    """One search alone: its parts without their first axis."""
+    start, point, turned = (np.array(part, dtype=float)[None] for part in (home, *pose))
+    found = approach(simulator, start, point, turned, respect_limits=respect_limits)
+    return Approach(*(part[0] for part in found))
+
+
 def _has_arrived(found: Approach) -> bool:
-    return max(found.distance, found.turn) < _ARRIVED
+    return bool(max(found.distance, found.turn) < _ARRIVED)
 
 
 def _what_stopped(
@@ -119,14 +128,9 @@ def _nearest(simulator: Simulator, home: Sequence[float], point: Array) -> float
     generator = np.random.default_rng(0)
     lower = np.maximum(simulator.joint_lower, -np.pi)
     upper = np.minimum(simulator.joint_upper, np.pi)
-    nearest = approach(simulator, home, point, respect_limits=False).distance
-    for _ in range(_STARTS):
-        if nearest < _ARRIVED:
-            break
-        start = generator.uniform(lower, upper)
-        again = approach(simulator, start.tolist(), point, respect_limits=False)
-        nearest = min(nearest, again.distance)
-    return nearest
+    starts = np.stack([home, *generator.uniform(lower, upper, (_STARTS, len(lower)))])
+    points = np.tile(point, (len(starts), 1))
+    return float(approach(simulator, starts, points, respect_limits=False).distance.min())
 
 
 def _beyond_limits(simulator: Simulator, angles: Array) -> list[str]:

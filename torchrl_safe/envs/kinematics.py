@@ -79,75 +79,86 @@ class DampedLeastSquares:
 
 
 class Approach(NamedTuple):
-    """How near a search has brought the tool to a pose."""
+    """How near k searches have brought the tool to their poses."""
 
-    #: Joint angles, rad, ``(n,)``.
+    #: Joint angles, rad, ``(k, n)``.
     angles: Array
-    #: Distance from the position, m.
-    distance: float
-    #: Angle from the orientation, rad; 0 where any will do.
-    turn: float
+    #: Distances from the positions, m, ``(k,)``.
+    distance: Array
+    #: Angles from the orientations, rad, ``(k,)``; 0 where any will do.
+    turn: Array
 
 
 def approach(
     simulator: Simulator,
-    start: Sequence[float] | Array,
+    start: Array,
     position: Array,
     orientation: Array | None = None,
     *,
     arrived: float = 1e-5,
     respect_limits: bool = True,
 ) -> Approach:
-    """Searches joint angles that bring the tool to a pose, by damped least squares.
+    """Searches joint angles that bring the tool to poses, by damped least squares.
 
-    It goes downhill from where it starts, and may stop where only a detour leads on. The worlds
-    are to be reset afterwards.
+    Each search goes downhill from where it starts, and may stop where only a detour leads on. The
+    worlds are to be reset afterwards.
 
     Args:
         simulator: the worlds.
-        start: joint angles to begin from, rad, ``(n,)``.
-        position: where the tool is to get, m, ``(3,)``.
-        orientation: how it is to be turned, a quaternion (x, y, z, w), ``(4,)``. ``None`` leaves
+        start: joint angles to begin from, rad, ``(k, n)``.
+        position: where the tool is to get, m, ``(k, 3)``.
+        orientation: how it is to be turned, quaternions (x, y, z, w), ``(k, 4)``. ``None`` leaves
             it open.
-        arrived: largest distance (m) and turn (rad) at which the search ends.
+        arrived: largest distance (m) and turn (rad) at which a search ends.
         respect_limits: keep to the joint limits.
     """
     angles = np.array(start, dtype=float)
-    best = Approach(angles, np.inf, np.inf)
+    best = Approach(angles.copy(), *np.full((2, len(angles)), np.inf))
+    searching = np.arange(len(angles))
     for _ in range(_ITERATIONS):
-        tool, turned = (part[0] for part in simulator.tool_at(angles[None]))
-        way = position - tool
-        parts = [way]
+        tool, turned = simulator.tool_at(angles[searching])
+        parts = [position[searching] - tool]
         if orientation is not None:
-            parts.append(rotation_vector(turned[None], orientation[None])[0])
-        now = Approach(angles, *(float(np.linalg.norm(part)) for part in [*parts, np.zeros(1)][:2]))
-        if now.distance + now.turn < best.distance + best.turn:
-            best = now
-        if max(now.distance, now.turn) < arrived:
+            parts.append(rotation_vector(turned, orientation[searching]))
+        distance, turn = [*(_length(part)[:, 0] for part in parts), np.zeros(len(tool))][:2]
+        nearer = distance + turn < best.distance[searching] + best.turn[searching]
+        for kept, now in zip(best, (angles[searching], distance, turn), strict=True):
+            kept[searching[nearer]] = now[nearer]
+        far = np.maximum(distance, turn) >= arrived
+        searching = searching[far]
+        if not searching.size:
             break
         # Far away the Jacobian is no guide: steps are short.
-        error = np.concatenate([_shortened(part) for part in parts])
-        jacobian = simulator.jacobian(angles[None])[0, : len(error)]
-        damped = jacobian @ jacobian.T + _DAMPING * np.eye(len(error))
-        angles = angles + jacobian.T @ np.linalg.solve(damped, error)
+        error = np.concatenate([_shortened(part[far]) for part in parts], axis=1)
+        jacobian = simulator.jacobian(angles[searching])[:, : error.shape[1]]
+        transposed = jacobian.transpose(0, 2, 1)
+        damped = jacobian @ transposed + _DAMPING * np.eye(error.shape[1])
+        change = transposed @ np.linalg.solve(damped, error[:, :, None])
+        after = angles[searching] + change[:, :, 0]
         if respect_limits:
-            angles = np.clip(angles, simulator.joint_lower, simulator.joint_upper)
+            after = np.clip(after, simulator.joint_lower, simulator.joint_upper)
+        angles[searching] = after
     return best
 
 
+def _length(vectors: Array) -> Array:
+    return np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 def _shortened(error: Array) -> Array:
-    return error * min(1.0, _LONGEST_STEP / max(float(np.linalg.norm(error)), 1e-9))
+    return error * np.minimum(1.0, _LONGEST_STEP / np.maximum(_length(error), 1e-9))
 
 
-def distance_to_reach(simulator: Simulator, start: Sequence[float], point: Array) -> float:
-    """Returns how far from a point the tool stays, m, however it is turned; 0 if it gets there.
+def distance_to_reach(simulator: Simulator, start: Sequence[float], points: Array) -> Array:
+    """Returns how far from points the tool stays, m, ``(k,)``, however it is turned.
 
-    The worlds are to be reset afterwards.
+    0 where it gets there. The worlds are to be reset afterwards.
 
     Args:
         simulator: the worlds.
         start: joint angles to begin from, rad, ``(n,)``.
-        point: where the tool is to get, m, ``(3,)``.
+        points: where the tool is to get, m, ``(k, 3)``.
     """
-    distance = approach(simulator, start, point, arrived=_ARRIVED).distance
-    return 0.0 if distance < _ARRIVED else distance
+    starts = np.tile(np.array(start, dtype=float), (len(points), 1))
+    distance = approach(simulator, starts, points, arrived=_ARRIVED).distance
+    return np.where(distance < _ARRIVED, 0.0, distance)

@@ -49,18 +49,21 @@ class Starts:
             ValueError: if the arm does not reach what the task draws, or is hardly ever free.
         """
         generator = np.random.default_rng(0)
-        for _ in range(_CHECKED_STARTS):
-            goal, objects = self._begin(0, generator, _CHECKED_DRAWS)
-            for name, points in (("goals", goal[None]), ("objects", objects)):
-                for point in points:
-                    miss = distance_to_reach(self._simulator, self._arm.home, point)
-                    if miss > _REACHED:
-                        raise ValueError(
-                            f"task must draw {name} that the arm can reach, got "
-                            f"{point.round(3).tolist()} from {self._task}, from which the tool "
-                            f"stays {miss:.3f} m away: give the task another region, or the "
-                            "arm other goals."
-                        )
+        drawn = [self._begin(0, generator, _CHECKED_DRAWS) for _ in range(_CHECKED_STARTS)]
+        goals, objects = zip(*drawn, strict=True)
+        named = {"goals": np.stack(goals)}
+        if self._task.objects:
+            named["objects"] = np.concatenate(objects)
+        for name, points in named.items():
+            misses = distance_to_reach(self._simulator, self._arm.home, points)
+            for point, miss in zip(points, misses, strict=True):
+                if miss > _REACHED:
+                    raise ValueError(
+                        f"task must draw {name} that the arm can reach, got "
+                        f"{point.round(3).tolist()} from {self._task}, from which the tool "
+                        f"stays {miss:.3f} m away: give the task another region, or the "
+                        "arm other goals."
+                    )
 
     def begin(self, row: int, generator: np.random.Generator) -> None:
         """Begins an episode in one world.

@@ -18,7 +18,6 @@ from torchrl_safe.objectives.on_policy.p3o import P3OLoss
 from torchrl_safe.objectives.on_policy.ppo_lagrangian import PPOLagrangianLoss
 from torchrl_safe.objectives.rules.multipliers import DualAscent, MultiplierUpdater
 from torchrl_safe.objectives.rules.pid_control import PIDControl
-from torchrl_safe.objectives.rules.relative_pid import RelativePID
 from torchrl_safe.objectives.rules.violation import ViolationUpdater
 from torchrl_safe.objectives.trust_region.loss import TrustRegionLoss
 from torchrl_safe.objectives.trust_region.methods import (
@@ -47,7 +46,6 @@ __all__ = [
     "P3OLoss",
     "PIDControl",
     "PPOLagrangianLoss",
-    "RelativePID",
     "SACLagrangianLoss",
     "TD3LagrangianLoss",
     "TrustRegionLoss",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -71,13 +70,14 @@ class ConstrainedBandit(_OneStep):
     at the optimum: it never binds.
 
     The observation is constant, so critics are numbers that drop out when an advantage is centred.
-    With the reward advantage standardized and the cost advantage centred, as
-    ``estimate_advantages`` leaves them,
+    With both advantages standardized, as ``estimate_advantages`` leaves them,
 
     .. math::
-        A_r - \lambda A_c = \Big(\frac{1}{\sqrt{p (1 - p)}} - \lambda\Big) (1[A] - p),
+        A_r - \lambda A_c = \frac{1 - \lambda}{\sqrt{p (1 - p)}} (1[A] - p),
 
-    which vanishes at p = d for :math:`\lambda = 1 / \sqrt{d (1 - d)}`.
+    which vanishes at :math:`\lambda = 1`. (For a loss with ``normalize_cost_advantage=False`` it
+    is :math:`\lambda = 1 / \sqrt{d (1 - d)}`. The scale of the cost advantages falls slowly, so
+    that after some hundred batches the multiplier is still a few percent above 1.)
 
     Args:
         num_costs (int, optional): ``2``, or ``1`` to leave the second cost out.
@@ -109,8 +109,7 @@ class ConstrainedBandit(_OneStep):
     @property
     def optimal_multiplier(self) -> Tensor:
         """Multipliers at which the best policy has no gradient, shape (k,)."""
-        share = self.optimal_probability
-        return torch.tensor([1 / math.sqrt(share * (1 - share)), 0.0])[: self.num_costs]
+        return torch.tensor([1.0, 0.0])[: self.num_costs]
 
     def _outcome(self, action: Tensor) -> tuple[Tensor, Tensor]:
         cost = action.float()
@@ -300,7 +299,7 @@ def check_reaches_optimum(
         >>> from torchrl_safe.objectives import PIDControl, PPOLagrangianLoss
         >>> check_reaches_optimum(
         ...     partial(PPOLagrangianLoss, entropy_bonus=False),
-        ...     partial(PIDControl, kp=5.0, ki=1.0, kd=5.0, smoothing=0.5),
+        ...     partial(PIDControl, pessimism=0.0),
         ... )
     """
     shares, multipliers = train_on_bandit(

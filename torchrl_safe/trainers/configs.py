@@ -11,7 +11,6 @@ After :func:`register_configs` the groups of TorchRL have these names too, and t
 ``loss=crpo``                   :class:`~torchrl_safe.objectives.CRPOLoss`, the same
 ``updater=dual_ascent``         :class:`~torchrl_safe.objectives.DualAscent`
 ``updater=pid_control``         :class:`~torchrl_safe.objectives.PIDControl`
-``updater=relative_pid``        :class:`~torchrl_safe.objectives.RelativePID`
 ``updater=violation``           :class:`~torchrl_safe.objectives.ViolationUpdater`, for CRPO
 ``trainer=constrained_ppo``      :class:`~torchrl_safe.trainers.ConstrainedPPOTrainer`
 =============================== ==============================================================
@@ -92,7 +91,7 @@ class LagrangianLossConfig(WrappingLossConfig):
     """Configuration of :class:`~torchrl_safe.objectives.LagrangianLoss`."""
 
     multiplier_init: Any = 0.0
-    normalize_cost_advantage: bool = False
+    normalize_cost_advantage: bool = True
     _target_: str = "torchrl_safe.objectives.LagrangianLoss"
 
 
@@ -147,25 +146,14 @@ class DualAscentConfig(UpdaterConfig):
 class PIDControlConfig(UpdaterConfig):
     """Configuration of :class:`~torchrl_safe.objectives.PIDControl`."""
 
-    kp: float = MISSING
-    ki: float = MISSING
-    kd: float = MISSING
-    smoothing: float = 0.0
-    max_multiplier: float | None = None
-    normalize: bool = False
-    _target_: str = "torchrl_safe.objectives.PIDControl"
-
-
-@dataclass
-class RelativePIDConfig(UpdaterConfig):
-    """Configuration of :class:`~torchrl_safe.objectives.RelativePID`."""
-
     kp: float = 1.0
-    ki: float = 0.1
+    ki: float = 0.2
     kd: float = 0.0
+    smoothing: float = 0.0
     max_multiplier: float | None = 10.0
     pessimism: float = 2.0
-    _target_: str = "torchrl_safe.objectives.RelativePID"
+    normalize: bool = True
+    _target_: str = "torchrl_safe.objectives.PIDControl"
 
 
 @dataclass(kw_only=True)  # The parent has fields without a default behind these.
@@ -224,6 +212,5 @@ def register_configs() -> None:
     store(group="loss", name="crpo", node=CRPOLossConfig)
     store(group="updater", name="dual_ascent", node=DualAscentConfig)
     store(group="updater", name="pid_control", node=PIDControlConfig)
-    store(group="updater", name="relative_pid", node=RelativePIDConfig)
     store(group="updater", name="violation", node=ViolationUpdaterConfig)
     store(group="trainer", name="constrained_ppo", node=ConstrainedPPOTrainerConfig)

@@ -70,7 +70,7 @@ class Placement:
             ),
             "present": present,
         }
-        if not np.allclose(np.linalg.norm(filled["orientation"], axis=1), 1, atol=1e-3):
+        if (np.abs(np.linalg.norm(filled["orientation"], axis=1) - 1) > 1e-3).any():
             raise ValueError(
                 f"orientation must be unit quaternions (x, y, z, w), got {self.orientation}."
             )

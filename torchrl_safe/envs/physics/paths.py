@@ -36,6 +36,8 @@ def look_ahead(placement: Placement, elapsed: int, substeps: int) -> Ways:
     """
     times = SUBSTEP * np.arange(elapsed, elapsed + substeps + 1, dtype=float)
     positions, orientations = placement.at(times)
+    if placement.path is None:
+        return Ways(positions, orientations, *np.zeros((2, *positions.shape)))
     velocities = np.diff(positions, axis=0) / SUBSTEP
     spins = rotation_vector(orientations[:-1], orientations[1:]) / SUBSTEP
     moves = (np.concatenate([part[:1], part]) for part in (velocities, spins))

@@ -51,15 +51,18 @@ class ConstrainedLoss(CostCritic):
         self,
         *args: Any,
         multiplier_init: float | Tensor = 0.0,
-        normalize_cost_advantage: bool = False,
+        normalize_cost_advantage: bool | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
+        has_multipliers = "lagrange_multiplier" in self.cost_buffers
+        if normalize_cost_advantage is None:
+            normalize_cost_advantage = has_multipliers
         if not isinstance(normalize_cost_advantage, bool):
             raise TypeError(
                 f"normalize_cost_advantage must be a bool, got {normalize_cost_advantage!r}."
             )
-        if normalize_cost_advantage and "lagrange_multiplier" not in self.cost_buffers:
+        if normalize_cost_advantage and not has_multipliers:
             raise TypeError(
                 f"{type(self).__name__} compares the cost advantage with a violation, in the unit "
                 "of the cost: normalize_cost_advantage is not supported."

@@ -95,7 +95,7 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             Defaults to ``1.0``.
         normalize_cost_advantage (bool, optional): divide the cost advantages by their standard
             deviation, as :func:`~torchrl_safe.objectives.scaled_advantages` says, so that a
-            multiplier has no unit. Defaults to ``False``.
+            multiplier has no unit. Defaults to ``True``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:

@@ -50,7 +50,7 @@ class LagrangianLoss(ConstrainedLoss, WrappedLoss):
             policy out of the cost critic's loss. Defaults to ``False``.
         normalize_cost_advantage (bool, optional): divide the cost advantages by their standard
             deviation, as :func:`~torchrl_safe.objectives.scaled_advantages` says, so that a
-            multiplier has no unit. Defaults to ``False``.
+            multiplier has no unit. Defaults to ``True``.
 
     Raises:
         TypeError: if ``separate_losses`` is not a bool.
@@ -91,7 +91,7 @@ class LagrangianLoss(ConstrainedLoss, WrappedLoss):
         multiplier_init: float | Tensor = 0.0,
         cost_critic_coeff: float = 1.0,
         separate_losses: bool = False,
-        normalize_cost_advantage: bool = False,
+        normalize_cost_advantage: bool = True,
     ) -> None:
         super().__init__(
             loss_module,

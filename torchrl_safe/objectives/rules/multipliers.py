@@ -15,6 +15,11 @@ from torchrl.objectives import LossModule
 from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
+# A relative violation is judged no more finely than by this share of the limit.
+_SHARE_OF_LIMIT = 0.2
+# What each batch forgets of the scale of violations.
+_FORGOTTEN = 0.2
+
 
 class MultiplierUpdater(CostUpdater):
     """Moves the multipliers of a loss towards its cost limits, once for each collected batch.
@@ -36,13 +41,11 @@ class MultiplierUpdater(CostUpdater):
             added to it. A limit that binds is otherwise met on average only: policies end above
             it as often as below. Few or uneven episodes are trusted less; a batch of one
             episode has no standard error, and adds none. Defaults to ``0.0``.
-        normalize (bool, optional): divide the violation by what the costs are like: by the
-            larger of mean and limit, times the largest of mean, standard deviation and limit;
-            the largest of all batches so far, of which each new one forgets a tenth. Costs in
-            another unit, multiplied by ten say, then give a tenth of the multiplier and (with a
-            step that is proportional to the violation) change nothing else, and an early policy
-            that violates the limit a hundred times over does not throw the multiplier out of
-            reach. For costs that are never negative. Defaults to ``False``.
+        normalize (bool, optional): make the violation relative, with no unit and never more than 1:
+            divide it by the standard deviation of the episode costs, or by a fifth of the limit if
+            that is larger, and clip it to [-1, 1]. The divisor is the largest of all batches so
+            far, of which each new one forgets a fifth. Then costs and limit times 1,000 move the
+            same multipliers. Needs limits that are not negative. Defaults to ``False``.
         cost_names (sequence of str, optional): names of the k costs in their order, for example
             ``env.cost_names``: those of limits by name, and those that errors and logs use.
             Defaults to ``("0", "1", ...)``.
@@ -67,8 +70,6 @@ class MultiplierUpdater(CostUpdater):
     """
 
     buffer_name = "lagrange_multiplier"
-    # What of the scale of violations each batch forgets.
-    _forgotten = 0.1
 
     def __init__(
         self,
@@ -101,8 +102,8 @@ class MultiplierUpdater(CostUpdater):
             # Not of this batch alone: one with few costs would count for more than one with many,
             # and rare costs would exceed the limit on average.
             scale = torch.maximum(current, past)
-            violation = torch.where(scale > 0, violation / scale, 0.0)
-            cost_scale = torch.maximum(current, past.lerp(current, self._forgotten))
+            violation = torch.where(scale > 0, violation / scale, 0.0).clamp(-1, 1)
+            cost_scale = torch.maximum(current, past.lerp(current, _FORGOTTEN))
         proposal = self.next_multiplier(buffer, violation)
         # A proposal of infinity is one beyond the bound, if there is one.
         projected = proposal.clamp(0, self.max_multiplier)
@@ -114,10 +115,11 @@ class MultiplierUpdater(CostUpdater):
         self.cost_scale = cost_scale
 
     def _scale_of(self, episode_cost: Tensor) -> Tensor:
-        limit = self.cost_limit.to(episode_cost)
-        mean = episode_cost.mean(0)
-        deviation = episode_cost.std(0) if len(episode_cost) > 1 else mean
-        scale = torch.maximum(mean, limit) * torch.stack([mean, deviation, limit]).amax(0)
+        scale = _SHARE_OF_LIMIT * self.cost_limit.to(episode_cost)
+        if len(episode_cost) > 1:
+            scale = torch.maximum(scale, episode_cost.std(0))
+        # Under a limit of 0 costs that are all the same have no other scale.
+        scale = torch.where(scale > 0, scale, episode_cost.mean(0))
         # An infinite scale would never be forgotten.
         return scale.clamp_max(torch.finfo(scale.dtype).max)
 
@@ -167,8 +169,8 @@ class DualAscent(MultiplierUpdater):
         lr (float): step size, in multiplier per unit of violated cost.
         max_multiplier (float, optional): see :class:`MultiplierUpdater`.
         pessimism (float, optional): see :class:`MultiplierUpdater`.
-        normalize (bool, optional): see :class:`MultiplierUpdater`. ``lr`` is then in multiplier
-            times standard deviation of the episode cost.
+        normalize (bool, optional): see :class:`MultiplierUpdater`. ``lr`` is then the largest step
+            of a batch. Defaults to ``False``.
         optimizer (callable, optional): called as ``optimizer([parameter], lr=lr)``.
             Defaults to :class:`torch.optim.SGD`.
         parametrization (Transform, optional): the multiplier as a function of the parameter

@@ -14,16 +14,24 @@ from torchrl_safe.objectives.rules.multipliers import MultiplierUpdater
 
 
 class PIDControl(MultiplierUpdater):
-    r"""Proportional, integral and derivative control of the multipliers.
+    r"""Proportional, integral and derivative control of the multipliers; it needs a limit only.
 
     Presented in "Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", Stooke,
     Achiam, Abbeel 2020 (https://arxiv.org/abs/2007.03964), algorithm 2. With the mean episode
-    cost :math:`J`, its moving average :math:`\bar J` and the limit :math:`d`, each batch does
+    cost :math:`J` and the limit :math:`d`, both relative (``normalize``), and the moving average
+    :math:`\bar J`, each batch does
 
     .. math::
         I &\leftarrow \mathrm{clip}(I + k_i (J - d),\ 0,\ \mathrm{max}) \\
         \lambda &\leftarrow \mathrm{clip}(I + k_p (\bar J - d)
             + k_d (\bar J - \bar J_\mathrm{previous})_+,\ 0,\ \mathrm{max})
+
+    **The defaults have no unit.** A limit that is far away is approached at the same pace whether
+    costs are thousands or thousandths: the multiplier is 1.2 after the first batch and 5 after
+    twenty. It is bounded, since one that has grown while the task was not learnt yet would leave
+    the reward no weight to learn it. This needs advantages without a unit, which the losses have by
+    default (``normalize_cost_advantage``). With ``normalize=False`` the gains are in multiplier per
+    unit of cost, as published, and need tuning.
 
     The integral alone is :class:`~torchrl_safe.objectives.DualAscent` with ``lr = ki``. It lags
     behind the policy, so that cost and multiplier circle round their optimum: the proportional
@@ -47,16 +55,16 @@ class PIDControl(MultiplierUpdater):
 
     Keyword Args:
         cost_limit (float, Tensor or Mapping): see :class:`MultiplierUpdater`.
-        kp (float): proportional gain, in multiplier per unit of violated cost.
-        ki (float): integral gain, in multiplier per unit of violated cost and batch.
-        kd (float): derivative gain, in multiplier per unit of cost risen since the last batch.
+        kp (float, optional): proportional gain. Defaults to ``1.0``.
+        ki (float, optional): integral gain, for each batch. Defaults to ``0.2``.
+        kd (float, optional): derivative gain, for what the violation rose since the last batch.
+            Defaults to ``0.0``.
         smoothing (float, optional): weight of the past in the moving average of the cost, from 0
             up to but without 1. It starts at the first batch (algorithm 2 starts at 0, so that
             the first batch counts as a rise). Defaults to ``0.0``, the cost itself, as there.
-        max_multiplier (float, optional): see :class:`MultiplierUpdater`.
-        pessimism (float, optional): see :class:`MultiplierUpdater`.
-        normalize (bool, optional): see :class:`MultiplierUpdater`. The gains are then per unit of
-            normalized violation, whose rise it is that the derivative term answers.
+        max_multiplier (float, optional): see :class:`MultiplierUpdater`. Defaults to ``10.0``.
+        pessimism (float, optional): see :class:`MultiplierUpdater`. Defaults to ``2.0``.
+        normalize (bool, optional): see :class:`MultiplierUpdater`. Defaults to ``True``.
         cost_names (sequence of str, optional): see :class:`MultiplierUpdater`.
 
     Raises:
@@ -69,7 +77,18 @@ class PIDControl(MultiplierUpdater):
         >>> from torchrl.objectives import LossModule
         >>> loss = LossModule()
         >>> loss.register_buffer("lagrange_multiplier", torch.zeros(1))
-        >>> updater = PIDControl(loss, cost_limit=1.0, kp=2.0, ki=0.5, kd=1.0)
+        >>> limit = torch.tensor([25.0])
+        >>> updater = PIDControl(loss, cost_limit=limit, pessimism=0.0)
+        >>> updater.step(torch.tensor([[26.0], [28.0]]))  # 2 above; a fifth of 25 is 5
+        >>> loss.lagrange_multiplier  # 0.2 * 2 / 5 + 1.0 * 2 / 5
+        tensor([0.4800])
+
+        As published, in the unit of the cost:
+
+        >>> loss.lagrange_multiplier.zero_()
+        tensor([0.])
+        >>> settings = {"max_multiplier": None, "pessimism": 0.0, "normalize": False}
+        >>> updater = PIDControl(loss, cost_limit=1.0, kp=2.0, ki=0.5, kd=1.0, **settings)
         >>> updater.step(torch.tensor([[2.0]]))  # 0.5 * 1 + 2 * 1, and nothing to rise from
         >>> loss.lagrange_multiplier
         tensor([2.5000])
@@ -83,13 +102,13 @@ class PIDControl(MultiplierUpdater):
         loss_module: LossModule,
         *,
         cost_limit: float | Tensor | Mapping[str, float],
-        kp: float,
-        ki: float,
-        kd: float,
+        kp: float = 1.0,
+        ki: float = 0.2,
+        kd: float = 0.0,
         smoothing: float = 0.0,
-        max_multiplier: float | None = None,
-        pessimism: float = 0.0,
-        normalize: bool = False,
+        max_multiplier: float | None = 10.0,
+        pessimism: float = 2.0,
+        normalize: bool = True,
         cost_names: Sequence[str] | None = None,
     ) -> None:
         super().__init__(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -45,8 +46,12 @@ def read_meshes(root: Element) -> dict[str, bytes]:
     return files
 
 
+@lru_cache(maxsize=64)
 def _objects(text: str) -> list[bytes]:
-    """The objects of a Wavefront file, each with its corners and faces only."""
+    """The objects of a Wavefront file, each with its corners and faces only.
+
+    Environments are made again and again with one arm; to read its meshes took a quarter of that.
+    """
     corners: list[str] = []
     objects: list[list[list[int]]] = [[]]
     for line in text.splitlines():

@@ -1,0 +1,100 @@
+"""PIDControl with its defaults: relative violations, by hand and at the bounds."""
+
+import pytest
+import torch
+from torchrl.objectives import LossModule
+
+from torchrl_safe.objectives import PIDControl
+
+
+def make_updater(*multiplier, cost_limit=10.0, pessimism=0.0, **kwargs):
+    module = LossModule()
+    module.register_buffer("lagrange_multiplier", torch.tensor(multiplier or (0.0,)))
+    return PIDControl(module, cost_limit=cost_limit, pessimism=pessimism, **kwargs)
+
+
+def multiplier(updater):
+    return updater.loss_module.lagrange_multiplier
+
+
+def step(updater, *costs):
+    updater.step(torch.tensor(costs).reshape(len(costs), -1))
+    return multiplier(updater)
+
+
+def test_the_integral_stays_and_the_other_parts_do_not():
+    # v is 1/2, then 1, then 0: the last rise is one half, and a fall is none.
+    updater = make_updater(kp=0.5, ki=0.1, kd=0.3)
+    expected = [0.05 + 0.25, 0.15 + 0.5 + 0.3 * 0.5, 0.15]
+    for cost, value in zip((11.0, 12.0, 10.0), expected, strict=True):
+        torch.testing.assert_close(step(updater, cost), torch.tensor([value]))
+
+
+def test_pessimism_adds_standard_errors():
+    # Mean 10 and a standard error of 1, which is half of a fifth of the limit.
+    updater = make_updater(pessimism=1.0, kp=0.5, ki=0.1)
+    torch.testing.assert_close(step(updater, 9.0, 11.0), torch.tensor([0.6 * 0.5]))
+
+
+@pytest.mark.parametrize("limit", [0.025, 25.0, 25_000.0])
+def test_a_limit_that_is_far_away_is_answered_within_twenty_batches(limit):
+    """From nothing to a weight of the costs of five sixths, and back at the same pace."""
+    updater = make_updater(cost_limit=limit)
+    for _ in range(20):
+        step(updater, 50 * limit, 50 * limit)
+    assert multiplier(updater).item() == pytest.approx(5.0)
+    for _ in range(20):
+        step(updater, 0.0, 0.0)
+    assert multiplier(updater).item() == 0
+
+
+def test_it_winds_up_no_further_than_its_bounds():
+    updater = make_updater(max_multiplier=20.0, kp=0.5, ki=0.1)
+    for _ in range(1000):
+        assert step(updater, 500.0) <= 20
+    # The first batch within the limit is answered.
+    torch.testing.assert_close(step(updater, 0.0), torch.tensor([20 - 0.6]))
+    for _ in range(1000):
+        assert step(updater, 0.0) >= 0
+    torch.testing.assert_close(step(updater, 500.0), torch.tensor([0.6]))
+
+
+@pytest.mark.parametrize(("chance", "grows"), [(0.1, True), (0.025, False)])
+def test_rare_costs_are_judged_by_their_mean(chance, grows):
+    """One episode in ten costs 10: twice the limit of 0.5; one in forty: half of it."""
+    generator = torch.Generator().manual_seed(0)
+    updater = make_updater(5.0, cost_limit=0.5)
+    seen = []
+    for _ in range(300):
+        updater.step(10 * (torch.rand(16, 1, generator=generator) < chance).float())
+        seen.append(multiplier(updater).item())
+    mean = sum(seen[200:]) / 100
+    assert mean > 8 if grows else mean < 1
+
+
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+@pytest.mark.parametrize("cost", [0.0, 1e-38, 1e-9, 1e6, 3e20])
+def test_it_stays_finite_and_comes_back(cost, limit):
+    updater = make_updater(1.0, cost_limit=limit, pessimism=2.0)
+    spread = 0.5 + torch.rand(8, 1, generator=torch.Generator().manual_seed(0))
+    for episode_cost in (cost * spread, torch.tensor([[cost]])):
+        for _ in range(20):
+            updater.step(episode_cost)
+            assert 0 <= multiplier(updater).item() <= 10
+    if limit:
+        # The spread forgets a fifth in each batch: 3e20 in some 220.
+        for _ in range(400):
+            step(updater, 0.0, 0.0)
+        assert multiplier(updater).item() == 0
+
+
+def test_each_cost_for_itself():
+    both = make_updater(0.0, 3.0, cost_limit=torch.tensor([1.0, 50.0]))
+    alone = [make_updater(0.0, cost_limit=1.0), make_updater(3.0, cost_limit=50.0)]
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        costs = torch.tensor([2.0, 100.0]) * torch.rand(4, 2, generator=generator)
+        both.step(costs)
+        for index, updater in enumerate(alone):
+            updater.step(costs[:, index : index + 1])
+            torch.testing.assert_close(multiplier(both)[index], multiplier(updater)[0])
