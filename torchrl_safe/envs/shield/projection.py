@@ -46,7 +46,7 @@ def project(
         (array([[0. , 1.5]]), array([ True]))
     """
     point = np.clip(wanted, lower, upper)
-    solved = ((rows * point[:, None]).sum(axis=2) >= least - _TOLERANCE).all(axis=1)
+    solved = ((rows @ point[:, :, None])[:, :, 0] >= least - _TOLERANCE).all(axis=1)
     open_ = np.flatnonzero(~solved)
     if len(open_):
         bounds = lower[open_], upper[open_]
@@ -87,7 +87,7 @@ def _active_set(
     entering, weight = np.full(count, -1), np.zeros(count)
     solved, open_ = np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
     for _ in range(_ITERATIONS_PER_UNKNOWN * width):
-        slack = (rows * point[:, None]).sum(axis=2) - least
+        slack = (rows @ point[:, :, None])[:, :, 0] - least
         held = active >= 0
         index, slot = held.nonzero()
         slack[index, active[index, slot]] = np.inf

@@ -183,17 +183,19 @@ class Shield:
         asked = joints - angles
         now = self._measure(step, np.arange(len(angles)), angles, held)
         lower, upper = self._bounds(step, now, longest)
-        least = self._least(step, now) - (now.fingers * opening[:, None]).sum(axis=2)
+        least = self._least(step, now)
+        if opening.any():
+            least = least - (now.fingers @ opening[:, :, None])[:, :, 0]
         least = _attainable(now.joints, least, lower, upper)
         rows, least = self._with_walls(step, now.joints, least)
         change, solved = project(asked, rows, least, lower, upper)
         # Where the end of the step could be too near, that is measured as well.
-        left = now.room - now.closing + (now.joints * change[:, None]).sum(axis=2)
+        left = now.room - now.closing + (now.joints @ change[:, :, None])[:, :, 0]
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
         again = np.flatnonzero(solved & doubt)
         if len(again):
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
-            turned = (then.joints * change[again][:, None]).sum(axis=2)
+            turned = (then.joints @ change[again][:, :, None])[:, :, 0]
             needed = _needed(step, now.of(again), then) + turned
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             change[again], solved[again] = project(
@@ -217,7 +219,8 @@ class Shield:
         table = state.obstacle_position.shape[1]
         room = near.distance - np.where(near.other == table, self.table, self.margin)
         closing = np.zeros_like(room)
-        if table:
+        # Mostly nothing moves, and there is nothing to work out.
+        if state.obstacle_velocity.any() or state.obstacle_angular_velocity.any():
             which = np.minimum(near.other, table - 1)
             position, velocity, spin = (
                 part[rows][:, which]

@@ -130,7 +130,9 @@ class Ruler:
         self._qpos[rows[:, None], self._position] = angles
         self._place[rows], self._turn[rows] = position, orientation
         with quiet():
-            self._batch.forward(rows.tolist(), stage=mujoco.mjtStage.mjSTAGE_POS)
+            # Naming all of them takes longer.
+            named = None if len(rows) == len(self._qpos) else rows.tolist()
+            self._batch.forward(named, stage=mujoco.mjtStage.mjSTAGE_POS)
         ends = self._points[rows].reshape(len(rows), len(self._thing), 2, 3)
         point, way = ends[:, :, 0], ends[:, :, 0] - ends[:, :, 1]
         distance = np.sqrt((way * way).sum(axis=2))
