@@ -46,7 +46,7 @@ def project(
         (array([[0. , 1.5]]), array([ True]))
     """
     point = np.clip(wanted, lower, upper)
-    solved = ((rows @ point[:, :, None])[:, :, 0] >= least - _TOLERANCE).all(axis=1)
+    solved = np.asarray(((rows @ point[:, :, None])[:, :, 0] >= least - _TOLERANCE).all(axis=1))
     open_ = np.flatnonzero(~solved)
     if len(open_):
         bounds = lower[open_], upper[open_]

@@ -138,7 +138,7 @@ class Shield:
 
     margin: float = 0.02
     rate: float = 5.0
-    table: float = 0.005
+    table: float = 0.01
     reach: float = 0.3
     acceleration: float = 10.0
     obstacle_speed: float | None = None
