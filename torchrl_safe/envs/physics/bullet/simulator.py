@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +123,7 @@ class BulletSimulator:
 
     def state(self) -> ArmState:
         """Returns the state of all worlds."""
-        row = split(np.array(self._rows), self._parts)
+        row: dict[str, Any] = {**split(np.array(self._rows), self._parts)}
         tool = [row["ee_position"], *(row.pop(name) for name in TOOL_MOTION)]
         velocity = velocity_at(*([*part.T] for part in tool))
         del row["finger_velocity"]
