@@ -20,7 +20,7 @@ from benchmarks.timing import quartiles
 from torchrl_safe.envs import PANDA, ArmEnv
 from torchrl_safe.policy import Policy, load_policy
 
-README = Path(__file__).parent.parent / "README.md"
+QUICKSTART = Path(__file__).parent.parent / "docs" / "start" / "quickstart.md"
 
 
 class Drive(NamedTuple):
@@ -37,8 +37,8 @@ class Drive(NamedTuple):
 
 @contextmanager
 def policy_of_the_readme() -> Iterator[Path]:
-    """Trains with the README's own loop, for one batch, in another process; yields its file."""
-    loop = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)[0]
+    """Trains with the quickstart's own loop, for one batch, in another process; yields its file."""
+    loop = re.findall(r"```python\n(.*?)```", QUICKSTART.read_text(encoding="utf-8"), re.S)[1]
     with tempfile.TemporaryDirectory() as folder:
         short = loop.replace("total_frames=256_000", "total_frames=2_048")
         command = [sys.executable, "-c", short]

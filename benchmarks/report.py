@@ -105,7 +105,7 @@ def table(figures: Sequence[Figure]) -> str:
         f"{figure.low:.3g} to {figure.high:.3g} | {figure.bar} | {figure.verdict} |"
         for figure in figures
     ]
-    header = ["| | median | quartiles | bar | |", "|---|---|---|---|---|"]
+    header = ["| | median | quartiles | target | |", "|---|---|---|---|---|"]
     return "\n".join([*header, *rows])
 
 

@@ -1,28 +1,48 @@
-"""Sphinx: ``make docs`` builds the pages of this folder, the tutorial and the API reference."""
+"""Sphinx: ``make docs`` builds the pages of this folder, the tutorials and the API reference."""
 
+import sys
 from importlib.metadata import version as installed
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "torchrl-safe"
+copyright = "2026, the torchrl-safe authors"
 version = release = installed("torchrl-safe")
 html_theme = "furo"
+html_title = "torchrl-safe"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
+    # In _ext.
+    "autodoc_fixes",
+    "links",
+    "mathml",
+    "names",
 ]
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autosummary_generate = False  # The pages of reference/ are written by hand.
 autodoc_inherit_docstrings = False  # TorchRL and Gymnasium document their own.
-autodoc_typehints = "none"  # The docstrings have them.
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autodoc_typehints = "description"  # Where the docstring has none.
+autodoc_typehints_description_target = "documented_params"
+html_math_renderer = "mathml"
+myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 napoleon_use_ivar = True
-# Links to files of the repository, which are no pages.
-suppress_warnings = ["myst.xref_missing"]
-# `make test` runs the tutorial.
+# `make test` runs the tutorials.
 sphinx_gallery_conf = {
     "examples_dirs": "../tutorials",
     "gallery_dirs": "tutorials",
     "plot_gallery": False,
+    "show_memory": False,
+    "download_all_examples": False,
+    "write_computation_times": False,  # Their page loads scripts from elsewhere.
 }
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "_ext", "**sg_execution_times.rst"]

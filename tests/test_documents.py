@@ -1,4 +1,4 @@
-"""What the documents show runs: the README's training loop, and every tutorial."""
+"""What the documents show runs: README, the pages of the site, and every tutorial."""
 
 import math
 import re
@@ -46,13 +46,51 @@ print(action.shape)
 """
 
 
-def test_readme_loop(tmp_path):
-    loop, use = code_of("README.md")[:2]
+# Networks, a collector and costs for the loop that README shows.
+LOOP = """
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import RewardSum, TransformedEnv
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+
+sums = TransformedEnv(env, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
+width = env.observation_spec["observation"].shape[-1]
+net = torch.nn.Sequential(MLP(width, 6, num_cells=[8]), NormalParamExtractor())
+net = TensorDictModule(net, ["observation"], ["loc", "scale"])
+actor = ProbabilisticActor(net, net.out_keys, distribution_class=TanhNormal, return_log_prob=True)
+critic = ValueOperator(MLP(width, 1, num_cells=[8]), ["observation"])
+cost_critic = ValueOperator(MLP(width, 2, num_cells=[8]), ["observation"], ["cost_value"])
+collector = Collector(
+    sums, actor, frames_per_batch=160, total_frames=160, auto_register_policy_transforms=False
+)
+"""
+
+
+def test_readme(tmp_path):
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 120
+    env, loop = code_of("README.md")
+    check = """
+print(batch["advantage"].shape, batch["cost_advantage"].shape)
+print(updater.cost_names, loss.lagrange_multiplier.shape)
+"""
+    script = tmp_path / "readme.py"
+    script.write_text(env + LOOP + loop + check, encoding="utf-8")
+    assert run(script).splitlines()[-3:] == [
+        "torch.Size([4, 20, 2])",
+        "torch.Size([4, 40, 1]) torch.Size([4, 40, 2])",
+        "('collision', 'speed') torch.Size([2])",
+    ]
+
+
+def test_quickstart(tmp_path):
+    env, loop, use = code_of("docs/start/quickstart.md")
+    assert env == code_of("README.md")[0]
     assert len(loop.splitlines()) <= 40
     # The same program on fewer frames.
     short = loop.replace("total_frames=256_000", "total_frames=4_096")
     assert short != loop
-    script = tmp_path / "readme.py"
+    script = tmp_path / "quickstart.py"
     script.write_text(short, encoding="utf-8")
     lines = re.findall(
         r"cost \[(\S+)\] multiplier \[(\S+)\]",
@@ -60,36 +98,53 @@ def test_readme_loop(tmp_path):
     )
     assert len(lines) == 2
     for batch, (cost, shown) in enumerate(lines, start=1):
-        # What is printed is the rule at work, above a limit of 0.5.
-        assert float(cost) > 0.5
-        assert 0 < float(shown) < 1.01 + 0.2 * batch
+        # What is printed is the rule at work: a cost above the limit of 0.5 raises the multiplier.
+        assert float(shown) > 0 or float(cost) < 0.5
+        assert float(shown) < 1.01 + 0.2 * batch
+    assert max(float(shown) for _, shown in lines) > 0
     script.write_text(f"import torch\n{use}print(action.shape)\n{DRIVE}", encoding="utf-8")
     *moved, shape = run(script, tmp_path).splitlines()[-6:]
     assert shape == "(3,)"
     assert len({line for line in moved if line.startswith("moved by 0.")}) == 5
 
 
-RULE = """
-import torch
-from torchrl.objectives import LossModule
+def test_several_limits(tmp_path):
+    (code,) = code_of("docs/howto/several_limits.md")
+    short = code.replace("total_frames=256_000", "total_frames=2_048")
+    short = short.replace("range(10)", "range(1)")
+    assert short.count("2_048") == short.count("range(1)") == 1
+    script = tmp_path / "limits.py"
+    check = "print(episode_cost.shape[-1], *(m > 0 for m in loss.lagrange_multiplier.tolist()))\n"
+    script.write_text(short + check, encoding="utf-8")
+    # Random actions are too fast, and that alone is certain.
+    assert re.fullmatch("2 (True|False) True", run(script, tmp_path).splitlines()[-1])
+    assert list(tmp_path.glob("runs/two-limits/events*"))
 
-loss = LossModule()
-loss.register_buffer("lagrange_multiplier", torch.zeros(1))
-rule = Exponentiated(loss, cost_limit=0.5)
-for cost in (30.0, 0.0):
-    for _ in range(40):
-        rule.step(torch.full((4, 1), cost))
-        print(loss.lagrange_multiplier.item())
-"""
+
+def test_an_arm_of_ones_own(tmp_path):
+    script = tmp_path / "arm.py"
+    script.write_text("\n".join(code_of("docs/howto/arm.md")), encoding="utf-8")
+    home, success = run(script).splitlines()[-2:]
+    assert home.replace("-0.0,", "0.0,").replace("-0.0]", "0.0]") == (
+        "[0.0, -0.77, -0.26, 0.0, 1.02, 0.0]"
+    )
+    assert success == "1.0"
 
 
-def test_readme_recipes(tmp_path):
-    arm, cost, rule = code_of("README.md")[2:]
-    check = "print(env.rollout(3)['next', 'cost'].shape[-1])\n"
-    script = tmp_path / "recipes.py"
-    script.write_text("\n".join([arm, check, cost, check, rule, RULE]), encoding="utf-8")
-    one, two, *multipliers = map(float, run(script).split())
-    assert (one, two) == (1, 2)
+def test_a_cost_of_ones_own(tmp_path):
+    blocks = code_of("docs/howto/cost.md")
+    assert len(blocks) == 2
+    check = "print(env.rollout(3)['next', 'cost'].shape[-1])\nenv.close()\n"
+    script = tmp_path / "costs.py"
+    script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")
+    assert run(script).splitlines()[-2:] == ["2", "1"]
+
+
+def test_a_rule_of_ones_own(tmp_path):
+    rule, use = code_of("docs/howto/rule.md")
+    script = tmp_path / "rule.py"
+    script.write_text(f"{rule}\n{use}", encoding="utf-8")
+    multipliers = [float(line) for line in run(script).split()]
     # From 0 to effect within some batches, never by leaps, and down again when the limit is kept.
     assert multipliers[0] == pytest.approx(0.01, rel=0.25)
     assert all(0.8 < last / first < 1.25 for first, last in pairwise(multipliers))
@@ -98,15 +153,29 @@ def test_readme_recipes(tmp_path):
 
 
 def test_deploying_a_policy(tmp_path):
-    """What docs/robustness.md does with a file, on few episodes."""
+    """What docs/howto/deploy.md does with a file, on few episodes."""
     actor = TensorDictModule(MLP(40, 3), ["observation"], ["action"])
     save_policy(tmp_path / "policy.pt", actor, Composite(observation=Unbounded(40)))
-    load, measure = code_of("docs/robustness.md")[-2:]
+    load, drive, measure = code_of("docs/howto/deploy.md")
     short = measure.replace("num_envs=32", "num_envs=2").replace("256", "2")
     assert short != measure
     show = "print(action.shape, len(figures))\n"
-    (tmp_path / "deploy.py").write_text(load + short + show, encoding="utf-8")
-    assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-1] == "(3,) 5"
+    arm = """
+sent, began = [], __import__("time").perf_counter()
+def read_observation(): return np.zeros(40)
+def send_action(action): sent.append(action)
+def is_running(): return len(sent) < 4
+"""
+    pace = "print(len(sent), 0.15 <= time.perf_counter() - began)\n"
+    code = load + arm + drive + pace + short + show
+    (tmp_path / "deploy.py").write_text(code, encoding="utf-8")
+    assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-2:] == ["4 True", "(3,) 5"]
+
+
+def test_any_environment(tmp_path):
+    code = code_of("docs/safe_gym.md")[0]
+    (tmp_path / "oven.py").write_text(code, encoding="utf-8")
+    assert run(tmp_path / "oven.py").splitlines()[-1] == "torch.Size([3, 1])"
 
 
 def test_environments(tmp_path):
@@ -161,6 +230,23 @@ def test_algorithms(tmp_path):
     assert [line for line in run(script).splitlines() if "[torchrl]" not in line] == [
         "tensor(True) 0"
     ]
+
+
+def test_every_algorithm(tmp_path):
+    """The page of each algorithm runs on the same networks and the same batch."""
+    pages = sorted((ROOT / "docs" / "algorithms").glob("*.md"))
+    assert len(pages) == 14
+    setting = code_of("docs/algorithms.md")[0]
+    blocks = [code_of(page.relative_to(ROOT)) for page in pages]
+    assert all(len(block) == 1 for block in blocks)
+    uses = [
+        f"{block}{'losses' if 'losses' in block else 'env.rollout(2)'}\nprint({page.stem!r})\n"
+        for page, (block,) in zip(pages, blocks, strict=True)
+    ]
+    script = tmp_path / "algorithms.py"
+    script.write_text("\n".join([setting, *uses]), encoding="utf-8")
+    shown = [line for line in run(script).splitlines() if line in {page.stem for page in pages}]
+    assert shown == [page.stem for page in pages]
 
 
 def test_trainers(tmp_path):

@@ -2,11 +2,11 @@
 A safe policy for a robot arm, in plain TorchRL
 ===============================================
 
-A robot arm is to reach a target that stands behind an obstacle. The shortest way leads through
-the obstacle, so an agent that looks at the reward alone learns to hit it. This tutorial trains an
-agent that may do so only so often, with :class:`~torchrl_safe.objectives.PPOLagrangianLoss` and
-:class:`~torchrl_safe.objectives.PIDControl`, in a training loop that you own: everything else is
-TorchRL's.
+A robot arm has to reach a target behind an obstacle. The shortest way leads through the obstacle,
+so an agent that only sees the reward learns to hit it. You train an agent that keeps a limit on
+collisions, with :class:`~torchrl_safe.objectives.PPOLagrangianLoss` and
+:class:`~torchrl_safe.objectives.PIDControl`, in your own training loop. Everything else is plain
+TorchRL.
 
 The problem is a constrained Markov decision process: maximize the expected return while the
 expected cost of an episode stays below a limit,
@@ -25,8 +25,8 @@ is above the limit.
 #
 # These are small, so that the tutorial runs in seconds and shows how the parts fit. To see the arm
 # learn, set ``TOTAL_FRAMES = 256_000``, ``FRAMES_PER_BATCH = 2_048`` and ``NUM_ENVS = 32``, which
-# takes some minutes. ``make train`` is a longer recipe, which is more certain to keep the limit:
-# ``docs/limits.md`` says what it adds and why.
+# takes some minutes. ``make train`` is a longer recipe, which keeps the limit more reliably:
+# :doc:`Cost limits </limits>` says what it adds and why.
 
 import torch
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
@@ -52,8 +52,8 @@ torch.set_num_threads(1)
 # ---------------
 #
 # An :class:`~torchrl_safe.envs.ArmEnv` is put together from an arm, an action representation, a
-# task, obstacles and named costs. It is batched: each of its rows is a simulated world of its own.
-# ``cost`` stands in the reward spec, so that TorchRL's ``RewardSum`` sums it over an episode.
+# task, obstacles and named costs. It is batched: it simulates ``num_envs`` independent worlds.
+# ``cost`` is part of the reward spec, so TorchRL's ``RewardSum`` adds it up over an episode.
 
 
 def make_env(seed):
@@ -154,8 +154,8 @@ for batch in collector:
     print(history[-1])
 
 # %%
-# What it has learnt
-# ------------------
+# Play the policy
+# ---------------
 #
 # The deterministic policy, one whole episode in each world. ``render`` draws the worlds.
 

@@ -10,7 +10,7 @@ from torchrl_safe.envs.arms import IIWA, PANDA, UR5, UR10, XARM6, XARM7
 from torchrl_safe.envs.obstacles import Human, InFront, Moving, NoObstacles, Obstacles, Scattered
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
 
-#: The parts of the registered names, and what they stand for.
+#: Arms, by the first part of a registered name.
 ARMS = {
     "Panda": PANDA,
     "Iiwa": IIWA,
@@ -19,9 +19,11 @@ ARMS = {
     "UR5": UR5,
     "UR10": UR10,
 }
+#: Tasks, by the second part.
 TASKS: dict[str, Task] = {"Reach": Reach(), "Push": Push(), "PickAndPlace": PickAndPlace()}
 # Control steps of an episode, at 20 Hz; mostly enough for the scripted pilots of the tests.
 _TIME_LIMITS = {"Reach": 40, "Push": 200, "PickAndPlace": 100}
+#: Layouts of obstacles, by the third part, which may be empty.
 OBSTACLES: dict[str, Obstacles] = {
     "": NoObstacles(),
     "InFront": InFront(),
@@ -29,6 +31,7 @@ OBSTACLES: dict[str, Obstacles] = {
     "Moving": Moving(),
     "Human": Human(),
 }
+#: Action modes, by the last part: empty for Cartesian actions, ``Joint`` for joint actions.
 ACTIONS: dict[str, CartesianDelta | JointDelta] = {"": CartesianDelta(), "Joint": JointDelta()}
 
 
