@@ -16,7 +16,7 @@ NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrai
 	trust_region_optimum trust_region_step violation))
 
 .PHONY: train test test-kernels test-slow test-wheel test-safety-gymnasium safe-gym safe-gym-grid \
-	bench-omnisafe compare paper sweep profile gallery bench draws ray docs lint format type clean
+	bench-omnisafe compare paper sweep profile gallery bench draws attack ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -68,6 +68,9 @@ bench: $(READY)  ## ratios against the physics floor and other libraries; wants 
 
 draws: $(READY)  ## starts of every registered combination, without physics: how many find no room
 	$(BIN)/python tests/draws.py $(ARGS)
+
+attack: $(READY)  ## tries to make a shielded arm touch something: ARGS="--steps 1000000"
+	$(BIN)/python tests/attack.py $(ARGS)
 
 ray: $(READY)  ## two costs on a Ray cluster; on this machine, or on yours with ARGS="--address auto"
 	$(BIN)/python -m experiments.ray_training $(ARGS)

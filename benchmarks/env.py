@@ -29,6 +29,8 @@ from torchrl_safe.envs import (
     JointDelta,
     MuJoCo,
     NoObstacles,
+    Physics,
+    Shield,
     SpeedAndSeparation,
 )
 
@@ -157,6 +159,31 @@ def what_costs_cost(quick: bool) -> Iterator[Figure]:
     )
 
 
+def what_a_shield_costs(quick: bool) -> Iterator[Figure]:
+    """The same random actions with a shield and without, beside one obstacle."""
+    worlds, steps, rounds = (2, 4, 2) if quick else (32, 16, 9)
+    engines: dict[str, Physics] = {"MuJoCo": MuJoCo(1), "Bullet": Bullet()}
+    for (name, action), (engine, physics) in product(_ACTIONS.items(), engines.items()):
+        make = partial(
+            ArmEnv,
+            num_envs=worlds,
+            action=action,
+            physics=physics,
+            max_episode_steps=_ENDLESS,
+        )
+        with closing(make()) as plain, closing(make(shield=Shield())) as shielded:
+            times = race(
+                {"plain": rollout(plain, steps), "shield": rollout(shielded, steps)},
+                rounds=rounds,
+            )
+        yield ratio(
+            f"{name}, substeps 12, {worlds} worlds, {engine}: Shield / none (time)",
+            times["shield"],
+            times["plain"],
+            at_most=1.5,
+        )
+
+
 def against_panda_gym(quick: bool) -> Iterator[Figure]:
     """Episodes of 50 steps of 20 substeps, resets included, against PandaReach-v3."""
     worlds, rounds = (2, 2) if quick else (128, 5)
@@ -195,5 +222,6 @@ def run(*, quick: bool) -> list[Figure]:
         *parts_of_a_step(quick),
         *against_panda_gym(quick),
         *what_costs_cost(quick),
+        *what_a_shield_costs(quick),
         *bullet.of_floor(quick),
     ]

@@ -18,7 +18,7 @@ from experiments.agent import make_agent, make_q_agent, num_costs
 from experiments.compiling import compiled
 from experiments.config import Config
 from experiments.learners import Learner, NoiseSchedule, OnPolicyLearner, ReplayLearner
-from torchrl_safe.envs import EarlyTermination, Saute
+from torchrl_safe.envs import EarlyTermination, Saute, Shield
 from torchrl_safe.objectives import (
     CPO,
     PCPO,
@@ -126,6 +126,7 @@ class OnPolicy:
             divergence of two distributions cannot be, in one graph.)
         transforms: called as ``transforms(config)``, what is appended to the environment.
         training_transforms: the same, but not when the policy is evaluated.
+        shield: filters the actions, if given.
     """
 
     loss: Callable[..., LossModule]
@@ -136,6 +137,7 @@ class OnPolicy:
     compiles: bool = False
     transforms: Callable[[Config], list[Transform]] = no_transforms
     training_transforms: Callable[[Config], list[Transform]] = no_transforms
+    shield: Shield | None = None
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
@@ -180,6 +182,7 @@ class OffPolicy:
     Args:
         loss: called as ``loss(actor, critic, cost_critic, num_costs=, action_spec=)``.
         stochastic: whether the policy is a distribution; else noise is added to collect.
+        shield: filters the actions, if given.
     """
 
     loss: Callable[..., LossModule]
@@ -187,6 +190,7 @@ class OffPolicy:
     updater: Callable[[LossModule, Config], Updater | None] = move_multiplier
     transforms: Callable[[Config], list[Transform]] = no_transforms
     training_transforms: Callable[[Config], list[Transform]] = no_transforms
+    shield: Shield | None = None
 
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
@@ -259,6 +263,9 @@ def _terminating(config: Config) -> list[Transform]:
 
 ALGORITHMS: dict[str, Algorithm] = {
     "ppo": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, compiles=True),
+    "ppo-shield": OnPolicy(
+        _of_ppo(PPOLagrangianLoss), keep_multiplier, compiles=True, shield=Shield()
+    ),
     "ppo-lagrangian": OnPolicy(_of_ppo(PPOLagrangianLoss), compiles=True),
     "kl-ppo-lagrangian": OnPolicy(_wrapping(LagrangianLoss, KLPENPPOLoss)),
     "a2c-lagrangian": OnPolicy(_wrapping(LagrangianLoss, A2CLoss), epochs=1),

@@ -13,6 +13,7 @@ Action = Literal["cartesian", "joint"]
 Observation = Literal["full", "paper"]
 AlgorithmName = Literal[
     "ppo",
+    "ppo-shield",
     "ppo-lagrangian",
     "kl-ppo-lagrangian",
     "a2c-lagrangian",
@@ -55,7 +56,10 @@ class Config:
     paper: bool = False
     """Train in the paper's environment: its Panda, obstacle and actions, at 240 Hz."""
     algorithms: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
-    """What to train; ppo is PPO-Lagrangian with its multiplier fixed at 0."""
+    """What to train; ppo is PPO-Lagrangian with its multiplier fixed at 0, and ppo-shield the same
+    with a filter of its actions that keeps the arm off the obstacles while it learns."""
+    shield: bool = False
+    """Train ppo-shield as well, and draw the collisions summed over all of training."""
     cost_limit: float = 0.5
     """Limit of the expected cost of an episode: control steps in which the arm collides."""
     frames: int = 128_000
@@ -138,6 +142,8 @@ class Config:
             value, own = getattr(self, name), getattr(Config, name)
             if self.paper and value != own:
                 raise ValueError(f"{name} must be {own} with paper, got {value}.")
+        if self.paper and "ppo-shield" in self.chosen:
+            raise ValueError("shield must be False with paper, whose environment has none.")
         for name in self.algorithms:
             if self.paper and name in OFF_POLICY:
                 raise ValueError(
@@ -154,6 +160,12 @@ class Config:
                 f"frames_per_batch must be a multiple of envs, got {self.frames_per_batch} and "
                 f"{self.envs}."
             )
+
+    @property
+    def chosen(self) -> tuple[AlgorithmName, ...]:
+        """What to train: ``algorithms``, and what ``shield`` adds."""
+        more = self.shield and "ppo-shield" not in self.algorithms
+        return (*self.algorithms, "ppo-shield") if more else self.algorithms
 
     @property
     def processes(self) -> int:

@@ -90,6 +90,18 @@ def figures(
     }
 
 
+def summed_costs(
+    batch: TensorDictBase, rows: Sequence[dict[str, float]], cost_names: Sequence[str]
+) -> dict[str, float]:
+    """Costs of all control steps of a run, up to and with those of a batch."""
+    sums = batch["next", "cost"].flatten(0, -2).double().sum(0).tolist()
+    before = rows[-1] if rows else {}
+    return {
+        f"summed/{name}": before.get(f"summed/{name}", 0.0) + value
+        for name, value in zip(cost_names, sums, strict=True)
+    }
+
+
 def score(rows: Sequence[dict[str, float]], limit: float) -> float | None:
     """Mean return of some batches, if each of their mean costs is within the limit."""
     ended = [row for row in rows if "return" in row]

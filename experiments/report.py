@@ -15,6 +15,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_safe.metrics import mean
 
+_CURVES = {
+    "return": "episode return",
+    "cost": "episode cost: ",
+    "summed": "cost of all training: ",
+}
 COLOURS = ("tab:orange", "tab:blue", "tab:green", "tab:purple")
 
 
@@ -61,23 +66,31 @@ def seeds_within(costs: torch.Tensor, limit: float) -> str:
 
 
 def plot_curves(results: dict[str, Any], path: Path) -> None:
-    """Draws return and cost against frames, and the cost limit: the paper's Figure 2."""
+    """Draws return and cost against frames, and the cost limit: the paper's Figure 2.
+
+    With a shield also the costs summed over all of training.
+    """
     runs = results["algorithms"]
     history = next(iter(runs.values()))["history"]
     costs = [key for key in max(history, key=len) if key.startswith("cost/")]
-    size = (5 * (1 + len(costs)), 3.6)
-    figure, grid = plt.subplots(1, 1 + len(costs), figsize=size, squeeze=False)
+    sums = [f"summed/{key.partition('/')[2]}" for key in costs if "ppo-shield" in runs]
+    keys = ["return", *costs, *sums]
+    figure, grid = plt.subplots(1, len(keys), figsize=(5 * len(keys), 3.6), squeeze=False)
     axes = list(grid[0])
-    for axis, key in zip(axes, ["return", *costs], strict=True):
+    for axis, key in zip(axes, keys, strict=True):
         for index, (name, run) in enumerate(runs.items()):
             colour = COLOURS[index] if index < len(COLOURS) else plt.get_cmap("tab20")(index)
             rows = [row for row in run["history"] if key in row]
             axis.plot([r["frames"] for r in rows], [r[key] for r in rows], color=colour, label=name)
-        axis.set(xlabel="frames", ylabel=f"episode {key.replace('/', ': ')}")
+        kind, _, cost = key.partition("/")
+        axis.set(xlabel="frames", ylabel=_CURVES[kind] + cost)
         axis.grid(alpha=0.3)
-    for axis in axes[1:]:
+    for axis in axes[1 : 1 + len(costs)]:
         axis.axhline(results["config"]["cost_limit"], color="black", ls="--", label="limit")
-    axes[-1].legend()
+    for axis in axes[1 + len(costs) :]:
+        # From none to thousands.
+        axis.set_yscale("symlog", linthresh=10)
+    axes[len(costs)].legend()
     figure.tight_layout()
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -28,7 +28,7 @@ from experiments.algorithms import ALGORITHMS, Training
 from experiments.config import AlgorithmName, Config
 from experiments.files import is_new, write_whole
 from experiments.grid import side_by_side
-from experiments.log import Log, figures, score, versions
+from experiments.log import Log, figures, score, summed_costs, versions
 from experiments.report import plot_curves, save_animation, save_picture, table
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
 from torchrl_safe.collectors import ResumableCollector
@@ -80,7 +80,7 @@ PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": P
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
 COSTS = {"collision": Collision()}
 # What may be another when a run is resumed: it changes nothing in what is learnt.
-CHANGEABLE = ("algorithms", "jobs", "out", "logger", "resume", "checkpoint_every")
+CHANGEABLE = ("algorithms", "shield", "jobs", "out", "logger", "resume", "checkpoint_every")
 
 
 def make_env(
@@ -116,6 +116,7 @@ def make_env(
             obstacles=OBSTACLES[config.obstacles],
             costs=COSTS,
             physics=PHYSICS[config.physics],
+            shield=ALGORITHMS[algorithm].shield,
             **{"max_episode_steps": steps, **settings},
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
@@ -222,6 +223,7 @@ def train(
             collector.update_policy_weights_()
             bar.update(batch.numel())
             row = figures(episodes, training.loss, tuple(COSTS))
+            row |= summed_costs(batch, log.rows, tuple(COSTS))
             bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
             log.add({"frames": log.frames + batch.numel(), **row})
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
@@ -310,13 +312,13 @@ def finish(
 def main(config: Config) -> None:
     """Trains and evaluates each algorithm, then writes the comparison."""
     results = start(config)
-    todo = [name for name in config.algorithms if name not in results["algorithms"]]
+    todo = [name for name in config.chosen if name not in results["algorithms"]]
     for algorithm, result in finish(config, todo):
         done = {**results["algorithms"], algorithm: result}
         # In one order, whichever ends first.
-        results["algorithms"] = {n: done[n] for n in (*config.algorithms, *done) if n in done}
+        results["algorithms"] = {n: done[n] for n in (*config.chosen, *done) if n in done}
         write_whole(config.out / "results.json", json.dumps(results, indent=1, default=str))
-    stage = make_env(config, num_envs=1, seed=config.seed, algorithm=config.algorithms[0])
+    stage = make_env(config, num_envs=1, seed=config.seed, algorithm=config.chosen[0])
     save_picture(stage, config.out / "scene.png")
     stage.close()
     plot_curves(results, config.out / "curves.png")

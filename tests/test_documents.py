@@ -188,6 +188,11 @@ def test_environments(tmp_path):
     run(script)
 
 
+def test_shield(tmp_path):
+    (script := tmp_path / "shield.py").write_text(*code_of("docs/shield.md"), encoding="utf-8")
+    assert run(script).startswith("torch.Size([2, 5, 1])")
+
+
 def test_the_circle_is_followed():
     """What environments.md shows as a task: going where the target is keeps the tool at it."""
     names = {"__name__": __name__}

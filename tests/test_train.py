@@ -19,7 +19,8 @@ from experiments.agent import make_agent
 from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES, OffPolicy
 from experiments.config import OFF_POLICY, AlgorithmName, Config
 from experiments.learners import NoiseSchedule
-from experiments.report import save_animation, table
+from experiments.log import summed_costs
+from experiments.report import plot_curves, save_animation, table
 from experiments.train import collecting, main, make_env, train
 from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
@@ -117,6 +118,36 @@ def test_help_names_the_options(capsys):
         "logger", "multiplier-rule",
     ):  # fmt: skip
         assert f"--{option}" in shown
+
+
+def test_a_shield_is_trained_with_beside_the_others():
+    algorithms = ("ppo", "ppo-lagrangian")
+    assert Config().chosen == algorithms
+    assert Config(shield=True).chosen == (*algorithms, "ppo-shield")
+    assert Config(shield=True, algorithms=("ppo-shield",)).chosen == ("ppo-shield",)
+    for algorithm in ("ppo", "ppo-shield"):
+        env = make_env(Config(), num_envs=1, algorithm=algorithm)
+        assert (env.base_env.shield is not None) == (algorithm == "ppo-shield")
+        env.close()
+
+
+def test_costs_are_summed_over_training():
+    costs = torch.tensor([[[1.0, 2.0], [0.0, 1.0]]])
+    batch = TensorDict({"next": {"cost": costs}}, [1, 2])
+    first = summed_costs(batch, [], ("a", "b"))
+    assert first == {"summed/a": 1.0, "summed/b": 3.0}
+    assert summed_costs(batch, [first], ("a", "b")) == {"summed/a": 2.0, "summed/b": 6.0}
+
+
+def test_curves_with_a_shield_show_the_sum(tmp_path):
+    widths = []
+    for name in ("ppo", "ppo-shield"):
+        row = {"frames": 8, "return": -1.0, "cost/collision": 1.0, "summed/collision": 3.0}
+        results = {"config": {"cost_limit": 0.5}, "algorithms": {name: {"history": [row]}}}
+        plot_curves(results, tmp_path / "curves.png")
+        with Image.open(tmp_path / "curves.png") as image:
+            widths.append(image.width)
+    assert widths == [1200, 1800]
 
 
 def test_multiplier_rules():
@@ -287,6 +318,7 @@ def test_noise_falls_from_batch_to_batch():
         ({"algorithms": ()}, "algorithms must name at least one"),
         ({"algorithms": ("cpo", "td3-lagrangian"), "paper": True}, "not contain td3-lagrangian"),
         ({"algorithms": ("ppo-saute",), "cost_limit": 0.0}, "cost_limit must be positive with ppo"),
+        ({"shield": True, "paper": True}, "shield must be False with paper"),
     ],
 )
 def test_bad_settings(settings, message):

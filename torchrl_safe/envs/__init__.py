@@ -22,6 +22,7 @@ from torchrl_safe.envs.costs import (
     ContactForce,
     JointLimit,
     Proximity,
+    ShieldCorrection,
     Speed,
     SpeedAndSeparation,
     Workspace,
@@ -50,8 +51,9 @@ from torchrl_safe.envs.paper import PAPER_CARTESIAN, PAPER_JOINT, PAPER_SETTINGS
 from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
 from torchrl_safe.envs.physics.mujoco import MuJoCo
 from torchrl_safe.envs.physics.scene import Camera, Scene
-from torchrl_safe.envs.physics.simulator import Physics, Simulator
+from torchrl_safe.envs.physics.simulator import Nearest, Physics, Simulator
 from torchrl_safe.envs.regions import NoRoomError, Region
+from torchrl_safe.envs.shield import Shield
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
 from torchrl_safe.envs.transforms import CostToReward, EarlyTermination, FrameSkip, Saute
@@ -94,6 +96,7 @@ __all__ = [
     "Motion",
     "Moving",
     "MuJoCo",
+    "Nearest",
     "NoObstacles",
     "NoRoomError",
     "Obstacles",
@@ -111,6 +114,8 @@ __all__ = [
     "Sensing",
     "Sensor",
     "Shape",
+    "Shield",
+    "ShieldCorrection",
     "Simulator",
     "Speed",
     "SpeedAndSeparation",

@@ -27,6 +27,7 @@ from torchrl_safe.envs.obstacles import InFront, Obstacles
 from torchrl_safe.envs.physics.bullet import Bullet
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Physics
+from torchrl_safe.envs.shield import Shield
 from torchrl_safe.envs.starts import Starts
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Sensor
 from torchrl_safe.envs.tasks import Reach, Task
@@ -47,7 +48,9 @@ class ArmEnv(EnvBase):
     under ``"next"`` also ``reward`` (N, 1), ``cost`` (N, k), ``success`` (N, 1), ``terminated``
     (N, 1; the task is done), ``truncated`` (N, 1; the time is up) and ``done`` (N, 1).
     ``cost`` stands in the reward spec, so that
-    ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])`` sums both.
+    ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])`` sums both. With a shield
+    there are also ``shield_correction`` (N, 1; by how much it has changed the joint targets, rad)
+    and ``shield_braked`` (N, 1; whether it held the arm still).
 
     Attributes:
         observation_fields: the slices of the observation by the names of its fields.
@@ -74,6 +77,8 @@ class ArmEnv(EnvBase):
             2 s at 20 Hz.
         scene (Scene, optional): gravity, fingers and motors. Defaults to ``Scene()``.
         physics (Physics, optional): the engine that simulates it. Defaults to ``Bullet()``.
+        shield (Shield, optional): changes actions as little as needed to keep the arm off obstacles
+            and table. ``action`` stays what was asked for. Defaults to ``None``.
         seed (int, optional): seed of the goals and obstacles. Every row has a generator of its
             own; the seeds follow TorchRL's chain: after ``set_seed`` of a ``ParallelEnv`` or a
             collector, two environments of one world draw what one of two worlds draws. A seed
@@ -116,6 +121,7 @@ class ArmEnv(EnvBase):
         max_episode_steps: int = 40,
         scene: Scene = Scene(),
         physics: Physics = Bullet(),
+        shield: Shield | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
         gui: bool = False,
@@ -127,6 +133,8 @@ class ArmEnv(EnvBase):
         check_kind("obstacles", obstacles, Obstacles)
         check_kind("scene", scene, Scene)
         check_kind("physics", physics, Physics)
+        if shield is not None:
+            check_kind("shield", shield, Shield)
         costs = {"collision": Collision()} if costs is None else costs
         check_kind("costs", costs, Mapping)
         if not costs:
@@ -145,8 +153,11 @@ class ArmEnv(EnvBase):
         self.max_episode_steps = max_episode_steps
         self.observation = observation
         self.physics = physics
+        self.shield = shield
         self.scene = replace(scene, free_fingers=scene.free_fingers or action.moves_fingers)
         self._begun = False
+        # What the shield has done in the last control step.
+        self._correction, self._braked = np.zeros(num_envs), np.zeros(num_envs, dtype=bool)
         # States of the generators before the running episodes were drawn.
         self._draws = np.zeros((num_envs, PACKED_SIZE), dtype=np.uint8)
         self.set_seed(seed)
@@ -161,6 +172,7 @@ class ArmEnv(EnvBase):
             objects=task.objects,
             sensing=reduce(or_, sensors.values(), Sensing()),
             frame_skip=frame_skip,
+            reach=None if shield is None else shield.reach,
             gui=gui,
         )
         self._starts = Starts(arm, task, obstacles, self._simulator)
@@ -180,6 +192,7 @@ class ArmEnv(EnvBase):
             "task": self.task,
             "obstacles": self.obstacles,
             "costs": self.costs,
+            "shield": self.shield,
         }
         return "\n".join(f"{name}={part}" for name, part in parts.items())
 
@@ -206,7 +219,7 @@ class ArmEnv(EnvBase):
     def _make_specs(self) -> None:
         for row in range(self.num_envs):
             self._reset_world(row, np.random.default_rng(0))
-        self._state = state = self._simulator.state()
+        self._state = state = self._read_state()
         # What the arguments compute is checked here once, so that it fails at the door.
         joints = state.joint_position.shape[1]
         width = self.action_mode.width(joints)
@@ -235,7 +248,11 @@ class ArmEnv(EnvBase):
         unbounded = partial(Unbounded, device=device, dtype=torch.float32)
         self.observation_spec = Composite(
             observation=unbounded((*batch, int(ends[-1]))),
-            success=Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device),
+            **{
+                key: Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
+                for key in (["success"] if self.shield is None else ["success", "shield_braked"])
+            },
+            **({} if self.shield is None else {"shield_correction": unbounded((*batch, 1))}),
             shape=batch,
         )
         bound, self._action_shape = self.action_mode.bound, (*batch, width)
@@ -264,10 +281,11 @@ class ArmEnv(EnvBase):
         for row in rows:
             self._reset_world(int(row), self._generators[int(row)])
         self._begun = True
-        self._state = self._simulator.state()
+        self._state = self._read_state()
         return self._pack(
             observation=self._observe(self._state),
             success=np.zeros((self.num_envs, 1), dtype=bool),
+            **self._shield_keys(),
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -278,14 +296,17 @@ class ArmEnv(EnvBase):
         joints, fingers = self.action_mode.targets(action, self._state, self._simulator)
         if self.scene.motor_limits:
             joints, fingers = self._within_speed(joints, fingers)
+        if self.shield is not None:
+            joints, fingers = self._shielded(self.shield, joints, fingers)
         self._simulator.advance(joints, fingers)
         before = replace(self._state, previous=None)
-        self._state = state = replace(self._simulator.state(), previous=before)
+        self._state = state = replace(self._read_state(), previous=before)
         reward, cost, success = self._outcome(state)
         truncated = (state.step >= self.max_episode_steps)[:, None] & ~success
         return self._pack(
             observation=self._observe(state),
             success=success,
+            **self._shield_keys(),
             reward=reward,
             cost=cost,
             terminated=success,
@@ -317,6 +338,7 @@ class ArmEnv(EnvBase):
         arrays = {
             "generators": np.stack([pack(generator) for generator in self._generators]),
             "draws": self._draws,
+            **({} if self.shield is None else self._shield_state()),
             **{_PHYSICS + name: array for name, array in self._simulator.save().items()},
         }
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
@@ -346,7 +368,10 @@ class ArmEnv(EnvBase):
         )
         self._begun = True
         self._generators = [unpack(packed) for packed in arrays["generators"]]
-        self._state = self._simulator.state()
+        if self.shield is not None:
+            for name, array in self._shield_state().items():
+                array[:] = arrays[name]
+        self._state = self._read_state()
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -413,9 +438,41 @@ class ArmEnv(EnvBase):
         change = np.clip(fingers - state.finger_position, -longest, longest)
         return joints, state.finger_position + change
 
+    def _shielded(self, shield: Shield, joints: Array, fingers: Array) -> tuple[Array, Array]:
+        simulator = self._simulator
+        speed = simulator.joint_speed if self.scene.motor_limits else np.inf
+        done = shield(
+            joints,
+            fingers,
+            self._state,
+            simulator,
+            longest=np.broadcast_to(speed / self.control_rate, joints.shape[1:]),
+            duration=1 / self.control_rate,
+        )
+        self._correction = np.linalg.norm(done.joints - joints, axis=1)
+        self._braked = done.braked
+        return done.joints, done.fingers
+
+    def _shield_state(self) -> dict[str, np.ndarray]:
+        return {"shield_correction": self._correction, "shield_braked": self._braked}
+
+    def _shield_keys(self) -> dict[str, np.ndarray]:
+        if self.shield is None:
+            return {}
+        return {name: array[:, None] for name, array in self._shield_state().items()}
+
     def _reset_world(self, row: int, generator: np.random.Generator) -> None:
         self._draws[row] = pack(generator)
+        self._correction[row], self._braked[row] = 0, False
         self._starts.begin(row, generator)
+
+    def _read_state(self) -> ArmState:
+        state = self._simulator.state()
+        if self.shield is None:
+            return state
+        return replace(
+            state, shield_correction=self._correction.copy(), shield_braked=self._braked.copy()
+        )
 
     def _observe(self, state: ArmState) -> Array:
         fields = self.observation(state).values()

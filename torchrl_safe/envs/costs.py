@@ -321,3 +321,37 @@ class Workspace:
     def __call__(self, state: ArmState) -> Array:
         """Returns the cost of each world, shape ``(N,)``."""
         return (~self.region.contains(state.trace["ee_position"])).any(axis=1).astype(float)
+
+
+@dataclass(frozen=True)
+class ShieldCorrection:
+    r"""By how much the shield has changed the action, in radians.
+
+    .. math::
+        c = |q_\text{executed} - q_\text{asked}|
+
+    with q the joint targets (rad) of the control step. With a limit on it a policy learns not to
+    lean on the :class:`~torchrl_safe.envs.Shield`, and to be safe without it.
+
+    Args:
+        margin: what does not count yet, rad.
+
+    Raises:
+        ValueError: if ``margin`` is negative or not finite, or in an environment without a
+            shield.
+
+    Examples:
+        >>> ShieldCorrection(margin=0.01)
+        ShieldCorrection(margin=0.01)
+    """
+
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_not_negative(margin=self.margin)
+
+    def __call__(self, state: ArmState) -> Array:
+        """Returns the cost of each world, rad, shape ``(N,)``."""
+        if state.shield_correction is None:
+            raise ValueError("shield must be given to ArmEnv for ShieldCorrection, got None.")
+        return np.maximum(0, state.shield_correction - self.margin)

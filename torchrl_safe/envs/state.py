@@ -130,6 +130,11 @@ class ArmState:
         trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
         previous: the state in which the control step began, without its own; ``None`` where a
             reset was the last thing that happened.
+        shield_correction: how far the joint targets of the last control step were from those that
+            the action asked for, rad, ``(N,)``: the length of the difference. 0 after a reset;
+            None without a :class:`~torchrl_safe.envs.Shield`.
+        shield_braked: in which worlds the shield held the arm still because nothing else was safe,
+            bool, ``(N,)``. None without a shield.
     """
 
     joint_position: Array
@@ -157,3 +162,5 @@ class ArmState:
     time: Array
     trace: Mapping[str, Array] = field(default_factory=Trace)
     previous: ArmState | None = None
+    shield_correction: Array | None = None
+    shield_braked: NDArray[np.bool_] | None = None

@@ -18,7 +18,8 @@ class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Observations and actions are float32 of shape ``(width,)``; actions beyond the bound of the
     action mode are clipped. ``step`` gives in its info ``cost`` (the sum of the costs),
-    ``costs`` (each by its name) and ``is_success``. ``reset(seed=...)`` decides on everything
+    ``costs`` (each by its name) and ``is_success``, with a shield also ``shield_correction``, rad,
+    and ``shield_braked``. ``reset(seed=...)`` decides on everything
     that follows, bit for bit.
 
     The time limit is the arm's own and sets ``truncated``. ``gymnasium.make`` keeps the argument
@@ -87,6 +88,9 @@ class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             "costs": dict(zip(self.arm_env.cost_names, costs, strict=True)),
             "is_success": after["success"].item(),
         }
+        if self.arm_env.shield is not None:
+            info["shield_correction"] = after["shield_correction"].item()
+            info["shield_braked"] = after["shield_braked"].item()
         return (
             self._observation(after),
             after["reward"].item(),

@@ -12,7 +12,7 @@ the number of worlds, n of arm joints, f of free finger joints, p of objects, m 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,27 @@ from torchrl_safe.envs.state import ArmState, Array, Sensing
 
 #: What :meth:`Simulator.save` returns: arrays by name, the worlds along the first axis of each.
 Saved = Mapping[str, NDArray[Any]]
+
+
+class Nearest(NamedTuple):
+    """Pairs of points at which the arm and what is around it are nearest to each other.
+
+    k worlds with r pairs each, of a convex shape of the arm that joints move and an obstacle or
+    the table. Each pair of shapes has one, or some more where a simulator finds several.
+    """
+
+    #: Distance of the two points, m, ``(k, r)``; negative where the shapes overlap, infinite where
+    #: there are no more pairs within reach.
+    distance: Array
+    #: Unit vectors from the other shape to the arm, ``(k, r, 3)``.
+    normal: Array
+    #: The points on the arm, m, ``(k, r, 3)``.
+    point: Array
+    #: By how much the distance grows with each joint and free finger, m/rad and m/m,
+    #: ``(k, r, n + f)``.
+    jacobian: Array
+    #: Which obstacle the other shape is, ``(r,)``; m is the table.
+    other: NDArray[np.int_]
 
 
 class Simulator(Protocol):
@@ -136,6 +157,21 @@ class Simulator(Protocol):
         In m, negative where they overlap; 0.1 where it is more, or without obstacles.
         """
 
+    def nearest(self, rows: NDArray[np.int_], joints: Array, fingers: Array) -> Nearest:
+        """Measures how far the arm would be from obstacles and table, in some of the worlds.
+
+        What of the arm only turns about vertical axes may be left out beside the table. It
+        changes nothing in any world.
+
+        Args:
+            rows: numbers of the worlds, ``(k,)``; obstacles are where they are there now.
+            joints: joint angles, rad, ``(k, n)``.
+            fingers: free finger joints, m, ``(k, f)``.
+
+        Raises:
+            ValueError: if the simulator was built without ``reach``.
+        """
+
     def pictures(self, camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
         """Returns an RGB picture of every world, ``(N, height, width, 3)``. Changes nothing."""
 
@@ -177,6 +213,7 @@ class Physics(Protocol):
         objects: Sequence[Shape] = (),
         sensing: Sensing = Sensing(),
         frame_skip: int = 12,
+        reach: float | None = None,
         gui: bool = False,
     ) -> Simulator:
         """Builds the worlds of an environment.
@@ -190,6 +227,7 @@ class Physics(Protocol):
             sensing: what is measured in every substep besides contacts.
             frame_skip: substeps of a control step, each of
                 :data:`~torchrl_safe.envs.physics.scene.SUBSTEP` seconds.
+            reach: distance up to which :meth:`Simulator.nearest` measures, m.
             gui: show the first world in a window.
 
         Raises:

@@ -71,6 +71,7 @@ class Bullet:
         objects: Sequence[Shape] = (),
         sensing: Sensing = Sensing(),
         frame_skip: int = 12,
+        reach: float | None = None,
         gui: bool = False,
     ) -> BulletSimulator:
         """Builds the worlds, see :class:`~torchrl_safe.envs.Physics`."""
@@ -83,5 +84,6 @@ class Bullet:
             objects=objects,
             sensing=sensing,
             frame_skip=frame_skip,
+            reach=reach,
             gui=gui,
         )

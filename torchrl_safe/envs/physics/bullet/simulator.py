@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,10 @@ from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.readings import Vector, velocity_at
 from torchrl_safe.envs.physics.bullet.record import TargetRecord
+from torchrl_safe.envs.physics.bullet.ruler import Ruler
 from torchrl_safe.envs.physics.bullet.world import TOOL_MOTION, World
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
-from torchrl_safe.envs.physics.simulator import Saved
+from torchrl_safe.envs.physics.simulator import Nearest, Saved
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class BulletSimulator:
         objects: what the task moves.
         sensing: what is measured in every substep.
         frame_skip: physics substeps of a control step.
+        reach: distance up to which :meth:`nearest` measures, m.
         gui: show the first world in PyBullet's window.
     """
 
@@ -57,11 +59,13 @@ class BulletSimulator:
         objects: Sequence[Shape],
         sensing: Sensing,
         frame_skip: int,
+        reach: float | None,
         gui: bool,
     ) -> None:
         self._build = (arm, scene, options, shapes, objects)
         self._frame_skip = frame_skip
         self._picture_world: World | None = None
+        self._ruler: Ruler | None = None
         #: The worlds.
         self.worlds: list[World] = []
         try:
@@ -69,6 +73,9 @@ class BulletSimulator:
                 self.worlds.append(
                     World(*self._build, sensing=sensing, gui=gui and row == 0),
                 )
+            if reach is not None:
+                merge = options.merged_links and not objects
+                self._ruler = Ruler(arm, scene, options, shapes, merge=merge, reach=reach)
         except BaseException:
             self.close()
             raise
@@ -116,7 +123,7 @@ class BulletSimulator:
 
     def state(self) -> ArmState:
         """Returns the state of all worlds."""
-        row = split(np.array(self._rows), self._parts)
+        row: dict[str, Any] = {**split(np.array(self._rows), self._parts)}
         tool = [row["ee_position"], *(row.pop(name) for name in TOOL_MOTION)]
         velocity = velocity_at(*([*part.T] for part in tool))
         del row["finger_velocity"]
@@ -154,6 +161,14 @@ class BulletSimulator:
     def clearance(self, row: int) -> float:
         """Returns the smallest distance of obstacles from arm and objects, up to 0.1 m."""
         return self.worlds[row].clearance()
+
+    def nearest(self, rows: NDArray[np.int_], joints: Array, fingers: Array) -> Nearest:
+        """Measures how far the arm would be from obstacles and table."""
+        if self._ruler is None:
+            raise ValueError("reach must be given to build to measure distances, got None.")
+        now = split(np.array([self._rows[row] for row in rows.tolist()]), self._parts)
+        angles = np.concatenate([joints, fingers], axis=1)
+        return self._ruler(angles, now["obstacle_position"], now["obstacle_orientation"])
 
     def save(self) -> Saved:
         """Returns the targets since the resets, and the states they have led to."""
@@ -196,6 +211,8 @@ class BulletSimulator:
             world.close()
         if self._picture_world is not None:
             self._picture_world.close()
+        if self._ruler is not None:
+            self._ruler.close()
 
 
 def parts(shapes: Mapping[str, tuple[int, ...]]) -> Parts:

@@ -139,11 +139,9 @@ def exclude_unreachable(spec: Any, arm: set[str], model: Any, data: Any, *, reac
         data: its state at home.
         reach: distance from which on contacts with the table are found, m.
     """
-    # Bodies whose frames keep their heights: what turns them, turns about vertical axes.
-    level = {0}
+    level = level_bodies(model, data)
     for body in range(1, model.nbody):
-        first, count = model.body_jntadr[body], model.body_jntnum[body]
-        joints = slice(first, first + count) if count else slice(0)
+        joints = _joints(model, body)
         turns = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE).all()
         if model.body_parentid[body] not in level or not turns:
             continue
@@ -152,5 +150,25 @@ def exclude_unreachable(spec: Any, arm: set[str], model: Any, data: Any, *, reac
         name = model.body(body).name
         if name in arm and data.xpos[body, 2] - radii.max(initial=0) > reach:
             spec.add_exclude(bodyname1="world", bodyname2=name)
-        if (np.abs(data.xaxis[joints, 2]) > 1 - 1e-9).all():
+
+
+def level_bodies(model: Any, data: Any) -> set[int]:
+    """Returns the bodies that turn about vertical axes, if at all: nothing of them rises or sinks.
+
+    Args:
+        model: the world, compiled.
+        data: any state of it.
+    """
+    level = {0}
+    for body in range(1, model.nbody):
+        joints = _joints(model, body)
+        turns = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE).all()
+        upright = (np.abs(data.xaxis[joints, 2]) > 1 - 1e-9).all()
+        if model.body_parentid[body] in level and turns and upright:
             level.add(body)
+    return level
+
+
+def _joints(model: Any, body: int) -> slice:
+    first, count = model.body_jntadr[body], model.body_jntnum[body]
+    return slice(first, first + count) if count else slice(0)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe.envs.physics.mujoco.vectors import turn
 from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.state import Array
+from torchrl_safe.envs.vectors import turn
 
 Indices = NDArray[np.int_]
 

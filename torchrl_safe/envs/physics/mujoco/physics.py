@@ -49,6 +49,7 @@ class MuJoCo:
         objects: Sequence[Shape] = (),
         sensing: Sensing = Sensing(),
         frame_skip: int = 12,
+        reach: float | None = None,
         gui: bool = False,
     ) -> MuJoCoSimulator:
         """Builds the worlds of an environment."""
@@ -64,6 +65,7 @@ class MuJoCo:
             objects=objects,
             sensing=sensing,
             frame_skip=frame_skip,
+            reach=reach,
         )
 
 

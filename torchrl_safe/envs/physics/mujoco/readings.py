@@ -13,9 +13,9 @@ from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.arm import ArmParts
 from torchrl_safe.envs.physics.mujoco.bodies import TABLE, obstacle
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
-from torchrl_safe.envs.physics.mujoco.vectors import cross
 from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.state import Array, Sensing
+from torchrl_safe.envs.vectors import cross
 
 #: Distance from which on contacts are reported, m, as PyBullet does.
 CONTACT_RANGE = 0.02

@@ -20,10 +20,11 @@ from torchrl_safe.envs.physics.mujoco.model import build_scenery, build_world
 from torchrl_safe.envs.physics.mujoco.motors import FINGER_GROUP, fill_controls
 from torchrl_safe.envs.physics.mujoco.pictures import Painter
 from torchrl_safe.envs.physics.mujoco.readings import nearest, touch_distance, touches
+from torchrl_safe.envs.physics.mujoco.ruler import Ruler
 from torchrl_safe.envs.physics.mujoco.tracks import Tracks
 from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
-from torchrl_safe.envs.physics.simulator import Saved
+from torchrl_safe.envs.physics.simulator import Nearest, Saved
 from torchrl_safe.envs.rotations import UPRIGHT
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 
@@ -42,6 +43,7 @@ class MuJoCoSimulator:
         objects: what the task moves.
         sensing: what is measured in every substep.
         frame_skip: substeps of a control step.
+        reach: distance up to which :meth:`nearest` measures, m.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class MuJoCoSimulator:
         objects: Sequence[Shape],
         sensing: Sensing,
         frame_skip: int,
+        reach: float | None,
     ) -> None:
         world = build_world(arm, scene, shapes, objects, sensing)
         model, parts = world.model, world.parts
@@ -74,6 +77,17 @@ class MuJoCoSimulator:
         self._pose: tuple[Array, ToolPose] | None = None
         self._controls = np.zeros((num_envs, frame_skip, model.nu))
         self._clearance = Clearance(model, [obstacle(index) for index in range(len(shapes))])
+        self._ruler: Ruler | None = None
+        if reach is not None:
+            self._ruler = Ruler(
+                arm,
+                scene,
+                threads=threads,
+                num_envs=num_envs,
+                shapes=shapes,
+                merge=not objects,
+                reach=reach,
+            )
 
         count = len(parts.joints)
         self.joint_lower, self.joint_upper = parts.joint_lower, parts.joint_upper
@@ -338,6 +352,14 @@ class MuJoCoSimulator:
     def clearance(self, row: int) -> float:
         """Returns the smallest distance of obstacles from arm and objects, up to 0.1 m."""
         return self._clearance(self._batch.state[row], self._tracks.present[row])
+
+    def nearest(self, rows: NDArray[np.int_], joints: Array, fingers: Array) -> Nearest:
+        """Measures how far the arm would be from obstacles and table."""
+        if self._ruler is None:
+            raise ValueError("reach must be given to build to measure distances, got None.")
+        now = self._obstacles()
+        angles = np.concatenate([joints, fingers], axis=1)
+        return self._ruler(rows, angles, now.position[rows], now.orientation[rows][..., TO_MUJOCO])
 
     def save(self) -> Saved:
         """Returns the table of states, and what was measured last."""

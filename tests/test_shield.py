@@ -1,0 +1,457 @@
+"""The shield: its distances, its projection, what it does to actions, and attacks on it."""
+
+from itertools import combinations
+
+import attack
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import linprog
+from states import make_state
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs.utils import check_env_specs
+from worlds import ENGINES, Places, each_arm, step
+
+from torchrl_safe.envs import (
+    PANDA,
+    ArmEnv,
+    Box,
+    CartesianDelta,
+    Collision,
+    Cylinder,
+    Human,
+    InFront,
+    JointDelta,
+    Moving,
+    NoObstacles,
+    Placement,
+    Region,
+    Scattered,
+    Scene,
+    Shield,
+    ShieldCorrection,
+    Sphere,
+)
+from torchrl_safe.envs.shield.projection import project
+
+# Of the room above the margin, what a control step of 1/20 s may use up.
+SHARE = 1 - np.exp(-5 / 20)
+# A Cartesian action towards the table.
+DOWN = torch.tensor([0.0, 0.0, -1.0])
+
+
+def brute_force(wanted, rows, least):
+    """The nearest point at which all inequalities hold, of all that some of them determine."""
+    best = None
+    for count in range(len(wanted) + 1):
+        for active in combinations(range(len(rows)), count):
+            chosen, bound = rows[list(active)], least[list(active)]
+            point = wanted + np.linalg.pinv(chosen) @ (bound - chosen @ wanted)
+            nearer = best is None or np.linalg.norm(point - wanted) < np.linalg.norm(best - wanted)
+            if nearer and (rows @ point >= least - 1e-9).all():
+                best = point
+    return best
+
+
+def problems(seed, count=40, unknowns=3, rows=5):
+    """Some with a solution and some without."""
+    rng = np.random.default_rng(seed)
+    return (
+        2 * rng.normal(size=(count, unknowns)),
+        rng.normal(size=(count, rows, unknowns)),
+        0.5 * rng.normal(size=(count, rows)),
+        -rng.uniform(0, 1, (count, unknowns)),
+        rng.uniform(0, 1, (count, unknowns)),
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_projections_are_the_nearest_points(seed):
+    points, solved = project(*problems(seed))
+    assert 10 < solved.sum() < 35
+    for index, (wanted, rows, least, lower, upper) in enumerate(zip(*problems(seed), strict=True)):
+        box = np.eye(len(wanted))
+        all_rows = np.concatenate([rows, box, -box])
+        expected = brute_force(wanted, all_rows, np.concatenate([least, lower, -upper]))
+        assert solved[index] == (expected is not None)
+        if expected is not None:
+            np.testing.assert_allclose(points[index], expected, atol=1e-7)
+
+
+def test_projections_know_when_there_is_no_solution():
+    """Of seven joints, as SciPy's linear programs have it."""
+    wanted, rows, least, lower, upper = problems(0, unknowns=7, rows=12)
+    points, solved = project(wanted, rows, least, lower, upper)
+    for index in range(len(wanted)):
+        bounds = list(zip(lower[index], upper[index], strict=True))
+        program = linprog(np.zeros(7), -rows[index], -least[index], bounds=bounds)
+        assert solved[index] == (program.status == 0)
+    assert (np.einsum("kri,ki->kr", rows, points) >= least - 1e-7)[solved].all()
+    assert 0 < solved.sum() < len(solved)
+
+
+def test_projections_do_not_depend_on_each_other():
+    arguments = problems(1, unknowns=7, rows=12)
+    points, solved = project(*arguments)
+    for index in range(len(points)):
+        alone, solves = project(*(part[index : index + 1] for part in arguments))
+        assert solves[0] == solved[index]
+        np.testing.assert_array_equal(alone[0], points[index])
+
+
+def test_rows_of_zeros_hold_always_or_never():
+    zeros, wide = np.zeros((2, 1, 2)), np.full((2, 2), 9.0)
+    _, solved = project(np.ones((2, 2)), zeros, np.array([[-1.0], [1.0]]), -wide, wide)
+    assert solved.tolist() == [True, False]
+
+
+def build(physics, arm=PANDA, free_fingers=False):
+    """Two worlds with a cylinder and a box beside the arm."""
+    simulator = physics.build(
+        arm,
+        Scene(free_fingers=free_fingers),
+        num_envs=2,
+        shapes=(Cylinder(), Box()),
+        reach=0.3,
+    )
+    for row in range(2):
+        placement = Placement([[0.5, 0.05, 0.1], [0.3, 0.35, 0.2]])
+        simulator.reset(row, placement, np.array([0.6, 0.0, 0.1]), np.zeros((0, 3)))
+    return simulator
+
+
+def nearest_of_each(simulator, joints, fingers):
+    """Distance and Jacobian of the nearest pair of each obstacle and the table, ``(2, 3, ...)``."""
+    near = simulator.nearest(np.arange(2), joints, fingers)
+    masked = [np.where(near.other == other, near.distance, np.inf) for other in range(3)]
+    pairs = np.stack([distance.argmin(axis=1) for distance in masked], axis=1)
+    rows = np.arange(2)[:, None]
+    return near.distance[rows, pairs], near.jacobian[rows, pairs]
+
+
+@pytest.mark.parametrize("free_fingers", [False, True])
+@pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
+def test_distances_change_as_their_jacobians_say(physics, free_fingers):
+    simulator = build(physics, free_fingers=free_fingers)
+    joints = PANDA.home + np.random.default_rng(0).normal(0, 0.2, (2, 7))
+    fingers = np.full((2, len(simulator.finger_speed)), 0.02)
+    distance, jacobian = nearest_of_each(simulator, joints, fingers)
+    assert (distance < 0.3).all()
+    angles, small = np.concatenate([joints, fingers], axis=1), 1e-3
+    for index in range(angles.shape[1]):
+        change = np.eye(angles.shape[1])[index] * small
+        ends = [np.split(angles + sign * change, [7], axis=1) for sign in (1, -1)]
+        more, less = (nearest_of_each(simulator, *end)[0] for end in ends)
+        np.testing.assert_allclose(jacobian[..., index], (more - less) / (2 * small), atol=0.01)
+    simulator.close()
+
+
+@each_arm
+def test_both_engines_measure_the_same(arm):
+    """But for the margin of a millimetre that PyBullet leaves."""
+    simulators = [build(physics, arm) for physics in ENGINES.values()]
+    joints = arm.home + np.random.default_rng(1).normal(0, 0.2, (2, len(arm.home)))
+    found = []
+    for simulator in simulators:
+        near = simulator.nearest(np.arange(2), joints, np.zeros((2, 0)))
+        found.append([np.sort(d[np.isfinite(d)]) for d in near.distance])
+        simulator.close()
+    for bullet, mujoco in zip(*found, strict=True):
+        np.testing.assert_allclose(bullet, mujoco, atol=2.5e-3)
+
+
+def test_measuring_changes_nothing(make_env, engine):
+    """And is only done where somebody wants it."""
+    plain, measured = (make_env(ArmEnv, seed=0, shield=shield) for shield in (None, Shield()))
+    with pytest.raises(ValueError, match="reach must be given"):
+        plain._simulator.nearest(np.arange(1), plain.arm_state.joint_position, np.zeros((1, 0)))
+    states = []
+    for env in (plain, measured):
+        env.reset()
+        state = env.arm_state
+        for _ in range(5):
+            if env is measured:
+                rows, fingers = np.arange(1), state.finger_position
+                env._simulator.nearest(rows, state.joint_position + 0.3, fingers)
+            env._simulator.advance(state.joint_position + 0.02, np.zeros((1, 0)))
+            state = env._simulator.state()
+        states.append(state.joint_position)
+    np.testing.assert_array_equal(*states)
+
+
+def turn(make_env, turntable, sphere, action=1.0, **settings):
+    """A step of the bar towards a ball beside its end; returns the environment."""
+    layout = Places(Sphere(0.1), at=[sphere])
+    env = make_env(ArmEnv, **{"shield": Shield(), **turntable, "obstacles": layout, **settings})
+    env.reset()
+    step(env, action)
+    return env
+
+
+def test_a_distance_shrinks_by_its_share(make_env, engine, turntable):
+    """By hand: the side of the bar is 0.1 m from the ball, and 0.45 m from the axis."""
+    env = turn(make_env, turntable, (0.45, 0.25, 0.5))
+    allowed = SHARE * (0.1 - 0.02) / 0.45
+    state = env.arm_state
+    assert state.shield_correction[0] == pytest.approx(0.1 - allowed, abs=1e-4)
+    assert not state.shield_braked[0]
+    assert state.joint_position[0, 0] == pytest.approx(allowed, rel=0.05)
+
+
+def test_what_leads_away_is_left_alone(make_env, engine, turntable):
+    state = turn(make_env, turntable, (0.45, 0.25, 0.5), action=-1.0).arm_state
+    assert state.shield_correction[0] == 0
+    assert state.joint_position[0, 0] == pytest.approx(-0.1, rel=0.05)
+
+
+def test_far_from_everything_a_shield_does_nothing(make_env, engine, turntable):
+    """Bit for bit."""
+    rollouts = []
+    for shield in (None, Shield()):
+        env = make_env(ArmEnv, **{**turntable, "num_envs": 2, "shield": shield})
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(10)["observation"])
+    torch.testing.assert_close(*rollouts, rtol=0, atol=0)
+
+
+def test_what_comes_is_given_way_to(make_env, engine, turntable):
+    """A ball that comes at 0.4 m/s pushes the bar, which is to rest, away before it touches it."""
+
+    def path(times):
+        positions = np.array([[[0.45, 0.25, 0.5]]]) - 0.4 * times[:, None, None] * [0, 1, 0]
+        return positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1, 1))
+
+    layout = Places(Sphere(0.1), at=[(0.45, 0.25, 0.5)], path=path)
+    for shield in (None, Shield()):
+        env = make_env(ArmEnv, **{**turntable, "obstacles": layout, "shield": shield})
+        env.reset()
+        costs = torch.cat([step(env, 0.0)["cost"] for _ in range(10)])
+        assert costs.any() == (shield is None)
+    assert env.arm_state.joint_position[0, 0] < -0.1
+
+
+def test_what_may_come_is_not_approached(make_env, engine, turntable):
+    """In a step of 1/20 s a ball of up to 2 m/s could take up the whole room."""
+    shield = Shield(obstacle_speed=2.0)
+    state = turn(make_env, turntable, (0.45, 0.25, 0.5), shield=shield).arm_state
+    assert state.joint_position[0, 0] == pytest.approx(0, abs=1e-3)
+    assert not state.shield_braked[0]
+
+
+def test_between_two_that_are_too_near_it_brakes(make_env, engine, turntable):
+    """Each would have the bar move towards the other."""
+    layout = Places(Sphere(0.1), Sphere(0.1), at=[(0.45, 0.16, 0.5), (0.45, -0.16, 0.5)])
+    env = make_env(ArmEnv, **{**turntable, "obstacles": layout, "shield": Shield()})
+    env.reset()
+    after = step(env, 1.0)
+    assert after["shield_braked"].item()
+    assert env.arm_state.joint_position[0, 0] == pytest.approx(0, abs=1e-3)
+    assert after["shield_correction"].item() == pytest.approx(0.1)
+
+
+def test_the_tool_stays_in_its_workspace(make_env, engine):
+    region = Region((0.2, -0.1, 0.1), (0.5, 0.1, 0.4))
+    shield = Shield(workspace=region)
+    env = make_env(ArmEnv, obstacles=NoObstacles(), shield=shield, max_episode_steps=99, seed=0)
+    env.reset()
+    for direction in ((1.0, 1.0, 0.0), (-1.0, -1.0, 1.0)):
+        for _ in range(15):
+            step(env, torch.tensor(direction))
+            assert region.contains(env.arm_state.ee_position + np.zeros(3)).all()
+
+
+def test_the_table_is_left_alone(make_env, engine):
+    """The gripper is pressed down, open or closed; without the shield it would touch."""
+    action = CartesianDelta(finger_step=0.04)
+    for shield in (None, Shield()):
+        env = make_env(
+            ArmEnv,
+            action=action,
+            obstacles=NoObstacles(),
+            costs={"table": Collision(table=True)},
+            shield=shield,
+            seed=0,
+        )
+        env.reset()
+        costs = [
+            step(env, torch.tensor([0.3, 0.0, -1.0, float(index % 2)]))["cost"].item()
+            for index in range(12)
+        ]
+        assert any(costs) == (shield is None)
+
+
+@pytest.mark.parametrize("obstacles", [NoObstacles(), Scattered(fewest=0), Human()], ids=str)
+def test_specs(make_env, engine, obstacles):
+    costs = {"collision": Collision(), "shield": ShieldCorrection()}
+    env = make_env(ArmEnv, num_envs=2, obstacles=obstacles, shield=Shield(), costs=costs, seed=0)
+    check_env_specs(env)
+    first = env.reset()
+    assert not first["shield_correction"].any()
+    assert not first["shield_braked"].any()
+    rollout = env.rollout(4)["next"]
+    torch.testing.assert_close(rollout["cost"][..., 1:], rollout["shield_correction"])
+    assert rollout["shield_correction"].shape == (2, 4, 1)
+
+
+def test_the_batch_holds_the_sampled_action(make_env, engine):
+    """And its log-probability: what was executed instead is the environment's doing."""
+    env = make_env(ArmEnv, num_envs=2, action=JointDelta(), shield=Shield(), seed=0)
+    sampled = []
+
+    def policy(tensordict):
+        action = torch.ones(2, 7) * (-1.0) ** torch.arange(7)
+        sampled.append(action)
+        return tensordict.set("action", action)
+
+    collector = Collector(env, policy, frames_per_batch=20, total_frames=20)
+    (batch,) = list(collector)
+    torch.testing.assert_close(batch["action"], torch.stack(sampled[-10:], dim=1))
+    assert batch["next", "shield_correction"].any()
+
+
+def test_checkpoints_bring_the_correction_back(make_env, engine):
+    env, other = (make_env(ArmEnv, num_envs=2, shield=Shield(), seed=0) for _ in range(2))
+    env.reset()
+    for _ in range(5):
+        step(env, DOWN)
+    assert env.arm_state.shield_correction.any()
+    other.load_state_dict(env.state_dict())
+    for name in ("shield_correction", "shield_braked", "joint_position"):
+        np.testing.assert_array_equal(getattr(env.arm_state, name), getattr(other.arm_state, name))
+    after = [step(each, DOWN)["shield_correction"] for each in (env, other)]
+    torch.testing.assert_close(*after, rtol=0, atol=0)
+
+
+def test_a_partial_reset_forgets_one_correction(make_env, engine):
+    env = make_env(ArmEnv, num_envs=2, shield=Shield(), seed=0)
+    env.reset()
+    before = [step(env, DOWN) for _ in range(5)][-1]["shield_correction"]
+    assert before.all()
+    env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+    after = env.arm_state.shield_correction
+    assert after[0] == 0
+    assert after[1] == pytest.approx(before[1].item())
+
+
+def test_a_world_is_the_same_alone_and_among_others(make_env, engine):
+    """Bit for bit, also where its neighbours make the shield measure twice."""
+    settings = {"action": JointDelta(), "shield": Shield(), "obstacles": Moving()}
+    actions = torch.rand(12, 3, 7) * 2 - 1
+    together = make_env(ArmEnv, num_envs=3, seed=0, **settings)
+    seed, found = 0, []
+    together.reset()
+    many = [step(together, action)["observation"] for action in actions]
+    for row in range(3):
+        alone = make_env(ArmEnv, seed=seed, **settings)
+        seed = alone.set_seed(seed)
+        alone.reset()
+        found.append([step(alone, action[row])["observation"][0] for action in actions])
+    for row in range(3):
+        expected = torch.stack([observation[row] for observation in many])
+        torch.testing.assert_close(torch.stack(found[row]), expected, rtol=0, atol=0)
+
+
+def test_gymnasium_tells_what_the_shield_did():
+    env = gymnasium.make("torchrl_safe/PandaReachInFront-v0", shield=Shield())
+    env.reset(seed=0)
+    *_, info = env.step(env.action_space.sample())
+    assert info["shield_braked"] is False
+    assert info["shield_correction"] >= 0
+    env.close()
+
+
+def test_corrections_cost_what_exceeds_a_margin():
+    state = make_state(shield_correction=[0.3, 0.05])
+    np.testing.assert_allclose(ShieldCorrection()(state), [0.3, 0.05])
+    np.testing.assert_allclose(ShieldCorrection(margin=0.1)(state), [0.2, 0.0])
+
+
+def test_a_correction_needs_a_shield():
+    with pytest.raises(ValueError, match="shield must be given to ArmEnv"):
+        ArmEnv(costs={"shield": ShieldCorrection()})
+    with pytest.raises(TypeError, match="shield must be an instance of Shield"):
+        ArmEnv(shield=0.02)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"margin": -0.1},
+        {"table": float("nan")},
+        {"rate": 0.0},
+        {"reach": 0.01},
+        {"acceleration": -1.0},
+        {"obstacle_speed": -1.0},
+    ],
+    ids=lambda settings: next(iter(settings)),
+)
+def test_bad_shields_are_refused(settings):
+    (name,) = settings
+    with pytest.raises(ValueError, match=name):
+        Shield(**settings)
+
+
+@pytest.mark.parametrize("kind", attack.ATTACKS)
+@pytest.mark.parametrize("action", attack.ACTIONS)
+def test_no_attack_makes_it_touch_what_stands(make_env, engine, action, kind):
+    env = make_env(
+        attack.make, PANDA, attack.ACTIONS[action], InFront(), ENGINES[engine], 8, seed=1
+    )
+    tally = attack.play(env, attack.ATTACKS[kind], 25)
+    assert tally.steps == 200
+    assert tally.touches == tally.table == 0
+
+
+def test_the_attacks_would_touch_it_else(make_env):
+    """Without the shield's rows: margins and rates that allow everything."""
+    lax = Shield(margin=0.0, table=0.0, rate=1e6, acceleration=1e6)
+    settings = {"shield": lax, "seed": 1}
+    action, physics = attack.ACTIONS["cartesian"], ENGINES["mujoco"]
+    env = make_env(attack.make, PANDA, action, InFront(), physics, 8, **settings)
+    assert attack.play(env, attack.greedy, 25).touches > 0
+
+
+@pytest.mark.slow
+@each_arm
+@pytest.mark.parametrize("layout", attack.FIXED)
+@pytest.mark.parametrize("action", attack.ACTIONS)
+def test_no_long_attack_makes_any_arm_touch_what_stands(make_env, engine, arm, action, layout):
+    physics = ENGINES[engine]
+    for kind in attack.ATTACKS:
+        env = make_env(
+            attack.make, arm, attack.ACTIONS[action], attack.FIXED[layout], physics, 16, seed=2
+        )
+        tally = attack.play(env, attack.ATTACKS[kind], 100)
+        assert tally.touches == tally.table == 0, f"{kind}: {tally}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", attack.MOVING)
+@pytest.mark.parametrize("action", attack.ACTIONS)
+def test_the_arm_never_moves_into_what_moves(make_env, engine, action, layout):
+    for kind in attack.ATTACKS:
+        env = make_env(
+            attack.make,
+            PANDA,
+            attack.ACTIONS[action],
+            attack.MOVING[layout],
+            ENGINES[engine],
+            16,
+            seed=3,
+        )
+        tally = attack.play(env, attack.ATTACKS[kind], 100)
+        assert tally.own == tally.table == 0, f"{kind}: {tally}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("action", attack.ACTIONS)
+def test_no_sequence_that_is_searched_for_touches(make_env, action):
+    """By the cross-entropy method, with all episodes alike."""
+    layout = Places(Cylinder(), at=[(0.5, 0.05, 0.1)])
+    physics = ENGINES["mujoco"]
+    env = make_env(attack.make, PANDA, attack.ACTIONS[action], layout, physics, 32)
+    tally = attack.evolve(env, generations=20, length=20)
+    assert tally.touches == tally.table == 0, str(tally)
+    assert tally.nearest < 0.05

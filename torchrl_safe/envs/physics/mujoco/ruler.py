@@ -1,0 +1,156 @@
+"""Measures how far the arm is from everything else, wherever it may be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.obstacles.shapes import Shape
+from torchrl_safe.envs.physics.mujoco.arm import read_arm
+from torchrl_safe.envs.physics.mujoco.bodies import TABLE, add_obstacle, add_table, obstacle
+from torchrl_safe.envs.physics.mujoco.contacts import level_bodies
+from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
+from torchrl_safe.envs.physics.scene import Scene
+from torchrl_safe.envs.physics.screws import distance_jacobian
+from torchrl_safe.envs.physics.simulator import Nearest
+from torchrl_safe.envs.state import Array
+
+# Distances are exact to this, m: curved shapes else take twice as long, for nanometres.
+_EXACT = 1e-3
+
+
+class Ruler:
+    """Worlds in which nothing collides: arm, table and obstacles, with a sensor for each pair.
+
+    They are worlds of their own because MuJoCo would read these sensors in every substep.
+
+    Args:
+        arm: the arm.
+        scene: what is around it.
+        threads: threads that the worlds are shared between.
+        num_envs: number N of worlds.
+        shapes: the m obstacles.
+        merge: make one link of those that fixed joints hold together.
+        reach: distance up to which is measured, m.
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        scene: Scene,
+        *,
+        threads: int,
+        num_envs: int,
+        shapes: Sequence[Shape],
+        merge: bool,
+        reach: float,
+    ) -> None:
+        spec, parts = read_arm(
+            arm,
+            fix_fingers=not scene.free_fingers,
+            merge=merge,
+            couple=False,
+            visuals=False,
+            itself=False,
+        )
+        spec.option.ccd_tolerance = _EXACT
+        solid = [
+            geom
+            for body in spec.bodies[1:]
+            for geom in body.geoms
+            if geom.contype or geom.conaffinity
+        ]
+        for number, geom in enumerate(solid):
+            geom.name = f"arm/{number}"
+        names = [geom.name for geom in solid]
+        add_table(spec, reach=0.0)
+        for index, shape in enumerate(shapes):
+            # Put in its place from outside, whether it has a mass or not.
+            add_obstacle(spec, index, replace(shape, mass=0.0), reach=0.0)
+        for geom in spec.geoms:
+            # Nobody meets anybody; with neither, MuJoCo takes a shape for a mere picture.
+            geom.contype, geom.conaffinity = 1, 0
+        model = spec.compile()
+        joints = [model.joint(name).id for name in parts.joints + parts.fingers]
+        moves = _moves(model)[:, joints]
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        level = level_bodies(model, data)
+        body = {name: int(model.geom(name).bodyid[0]) for name in names}
+        things = [*(obstacle(index) for index in range(len(shapes))), TABLE]
+        # What no joint moves is not the arm's doing, nor is the height of what turns level.
+        pairs = [
+            (name, thing)
+            for thing in things
+            for name in names
+            if moves[body[name]].any() and not (thing == TABLE and body[name] in level)
+        ]
+        for name, thing in pairs:
+            spec.add_sensor(
+                type=mujoco.mjtSensor.mjSENS_GEOMFROMTO,
+                objtype=mujoco.mjtObj.mjOBJ_GEOM,
+                objname=name,
+                reftype=mujoco.mjtObj.mjOBJ_GEOM,
+                refname=thing,
+                cutoff=reach,
+            )
+        model = spec.compile()
+        self._thing = np.array([things.index(thing) for _, thing in pairs], dtype=int)
+        geoms = np.array([model.geom(name).id for name, _ in pairs], dtype=int)
+        self._geom, self._moves = geoms, moves[model.geom_bodyid[geoms]]
+        self._joints, self._slides = joints, model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
+        self._position = model.jnt_qposadr[joints]
+        self._batch = batch.Batch(model, num_envs, min(threads, num_envs))
+        bind = self._batch.bind
+        self._qpos, self._place, self._turn = map(bind, ("qpos", "mocap_pos", "mocap_quat"))
+        self._axes, self._anchors, self._centres = map(bind, ("xaxis", "xanchor", "geom_xpos"))
+        self._points = bind("sensordata")
+        self._batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+
+    def __call__(
+        self,
+        rows: NDArray[np.int_],
+        angles: Array,
+        position: Array,
+        orientation: Array,
+    ) -> Nearest:
+        """Measures in some of the worlds.
+
+        Args:
+            rows: which, ``(k,)``.
+            angles: of joints and fingers, ``(k, n + f)``.
+            position: centres of the obstacles, m, ``(k, m, 3)``.
+            orientation: of the obstacles, quaternions (w, x, y, z), ``(k, m, 4)``.
+        """
+        self._qpos[rows[:, None], self._position] = angles
+        self._place[rows], self._turn[rows] = position, orientation
+        with quiet():
+            # Naming all of them takes longer.
+            named = None if len(rows) == len(self._qpos) else rows.tolist()
+            self._batch.forward(named, stage=mujoco.mjtStage.mjSTAGE_POS)
+        ends = self._points[rows].reshape(len(rows), len(self._thing), 2, 3)
+        point, way = ends[:, :, 0], ends[:, :, 0] - ends[:, :, 1]
+        distance = np.sqrt((way * way).sum(axis=2))
+        found = distance > 0
+        normal = way / np.where(found, distance, 1.0)[..., None]
+        # Where they overlap, the two points have changed sides.
+        inside = ((self._centres[rows][:, self._geom] - point) * normal).sum(axis=2) < 0
+        sign = np.where(inside, -1.0, 1.0)
+        normal, distance = normal * sign[..., None], distance * sign
+        anchor, axis = self._anchors[rows][:, self._joints], self._axes[rows][:, self._joints]
+        jacobian = distance_jacobian(point, normal, anchor, axis, self._slides) * self._moves
+        return Nearest(np.where(found, distance, np.inf), normal, point, jacobian, self._thing)
+
+
+def _moves(model: Any) -> NDArray[np.bool_]:
+    """Which joints move which bodies, ``(bodies, joints)``."""
+    moves = np.zeros((model.nbody, model.njnt), dtype=bool)
+    for body in range(1, len(moves)):
+        moves[body] = moves[model.body_parentid[body]]
+        moves[body, np.flatnonzero(model.jnt_bodyid == body)] = True
+    return moves

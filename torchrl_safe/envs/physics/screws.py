@@ -1,0 +1,36 @@
+"""How distances change with the joints, the same for every engine."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_safe.envs.state import Array
+from torchrl_safe.envs.vectors import cross
+
+
+def distance_jacobian(
+    point: Array, normal: Array, anchor: Array, axis: Array, slides: NDArray[np.bool_]
+) -> Array:
+    """Returns by how much points move along their normals with each joint, ``(k, r, n)``.
+
+    As products of lines (of the normals through the points) and screws (of the joints), for all
+    joints, also those that do not move the point.
+
+    Args:
+        point: points on the arm, m, ``(k, r, 3)``.
+        normal: unit vectors, ``(k, r, 3)``.
+        anchor: a point on the axis of each joint, m, ``(k, n, 3)``.
+        axis: directions of the joints, ``(k, n, 3)``.
+        slides: which joints slide instead of turning, ``(n,)``.
+
+    Examples:
+        >>> point, along_y = np.array([[[2.0, 0.0, 0.0]]]), np.array([[[0.0, 1.0, 0.0]]])
+        >>> origin, about_z = np.zeros((1, 1, 3)), np.array([[[0.0, 0.0, 1.0]]])
+        >>> distance_jacobian(point, along_y, origin, about_z, np.array([False]))
+        array([[[2.]]])
+    """
+    lines = np.concatenate([cross(point, normal), normal], axis=2)
+    slides = slides[:, None]
+    turning, moving = np.where(slides, 0.0, axis), np.where(slides, axis, cross(anchor, axis))
+    return lines @ np.concatenate([turning, moving], axis=2).transpose(0, 2, 1)

@@ -1,0 +1,129 @@
+"""Closest points under linear inequalities, for many small problems at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_safe.envs.state import Array
+
+# Constraints are added one by one, and now and then dropped again: a few times the number of
+# unknowns is enough. A problem that takes more is given up.
+_ITERATIONS_PER_UNKNOWN = 8
+# Constraints have unit length: how far beyond one is not beyond it, and what is parallel.
+_TOLERANCE, _PARALLEL = 1e-9, 1e-10
+
+
+def project(
+    wanted: Array, rows: Array, least: Array, lower: Array, upper: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    r"""Returns the points nearest to ``wanted`` at which linear inequalities hold.
+
+    .. math::
+        \min_x \tfrac12 |x - w|^2 \quad \text{such that} \quad A x \ge b, \quad l \le x \le u
+
+    Solved exactly, by the dual active-set method of Goldfarb and Idnani (1983, Mathematical
+    Programming 27). It begins with the bounds, which need no search. Then, as long as an inequality
+    is violated, it moves onto the most violated one while those that are already active stay so,
+    and drops those that no longer push. It ends after finitely many steps, and knows when there is
+    no solution. Most problems take none or one, and all N take their steps together. The result
+    of a problem does not depend on the others.
+
+    Args:
+        wanted: w, ``(N, n)``.
+        rows: A, ``(N, r, n)``.
+        least: b, ``(N, r)``; -inf for rows that do not count.
+        lower: l, ``(N, n)``; may be infinite.
+        upper: u, ``(N, n)``, not less than l; may be infinite.
+
+    Returns:
+        The points, ``(N, n)``, and which problems have a solution, ``(N,)``. Where there is
+        none, the point has no meaning.
+
+    Examples:
+        >>> wanted, bound = np.array([[-1.0, 2.0]]), np.full((1, 2), 1.5)
+        >>> project(wanted, np.array([[[1.0, 0.0]]]), np.zeros((1, 1)), -bound, bound)
+        (array([[0. , 1.5]]), array([ True]))
+    """
+    point = np.clip(wanted, lower, upper)
+    solved = np.asarray(((rows @ point[:, :, None])[:, :, 0] >= least - _TOLERANCE).all(axis=1))
+    open_ = np.flatnonzero(~solved)
+    if len(open_):
+        bounds = lower[open_], upper[open_]
+        point[open_], solved[open_] = _active_set(
+            wanted[open_], point[open_], *_unit(rows[open_], least[open_], *bounds)
+        )
+    return point, solved
+
+
+def _unit(rows: Array, least: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """All inequalities, the bounds at the end, with rows of unit length; or of none."""
+    lengths = np.sqrt((rows * rows).sum(axis=2))
+    # What does not depend on x always holds, or never: it is then a row that nothing satisfies.
+    flat = lengths <= _PARALLEL
+    scale = 1 / np.where(flat, 1.0, lengths)
+    rows = np.where(flat[..., None], 0.0, rows * scale[..., None])
+    each = np.broadcast_to(np.eye(rows.shape[2]), (len(rows), *2 * rows.shape[2:]))
+    return (
+        np.concatenate([rows, each, -each], axis=1),
+        np.concatenate([least * scale, lower, -upper], axis=1),
+    )
+
+
+def _active_set(
+    wanted: Array, point: Array, rows: Array, least: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Adds one constraint after the other, to begin with the bounds at which ``point`` is."""
+    count, width = point.shape
+    each, joint = np.arange(count), np.arange(width)
+    # Up to n active constraints of each problem: their rows, multipliers and numbers. A bound that
+    # is active at the beginning is in the slot of its unknown.
+    push = point - wanted
+    normals = np.sign(push)[:, :, None] * np.eye(width)
+    multipliers = np.abs(push)
+    active = rows.shape[1] - np.where(push > 0, 2, 1) * width + joint
+    active[push == 0] = -1
+    # The constraint that is being added, and its multiplier so far.
+    entering, weight = np.full(count, -1), np.zeros(count)
+    solved, open_ = np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
+    for _ in range(_ITERATIONS_PER_UNKNOWN * width):
+        slack = (rows @ point[:, :, None])[:, :, 0] - least
+        held = active >= 0
+        index, slot = held.nonzero()
+        slack[index, active[index, slot]] = np.inf
+        entering = np.where(entering < 0, slack.argmin(axis=1), entering)
+        missing = slack[each, entering]
+        solved |= open_ & (missing >= -_TOLERANCE)
+        open_ &= ~solved
+        if not open_.any():
+            break
+        normal = rows[each, entering]
+        # The part of it that the active ones do not span, and how much of each is in the rest.
+        gram = normals @ normals.transpose(0, 2, 1)
+        gram[:, joint, joint] += ~held
+        shares = np.linalg.solve(gram, normals @ normal[:, :, None])[:, :, 0]
+        free = normal - (normals * shares[:, :, None]).sum(axis=1)
+        length = (free * normal).sum(axis=1)
+        new = length > _PARALLEL
+        # How far until the constraint holds, or the multiplier of an active one is used up.
+        shrinks = held & (shares > _PARALLEL)
+        limits = np.where(shrinks, multipliers / np.where(shrinks, shares, 1.0), np.inf)
+        last = limits.argmin(axis=1)
+        full = np.where(new, -missing / np.where(new, length, 1.0), np.inf)
+        step = np.minimum(full, limits[each, last])
+        # Neither will ever happen: there is no solution.
+        open_ &= np.isfinite(step)
+        step = np.where(open_, step, 0.0)
+        point = point + np.where(new, step, 0.0)[:, None] * free
+        multipliers -= np.where(held, step[:, None] * shares, 0.0)
+        weight += step
+        joins = np.flatnonzero(open_ & (full <= limits[each, last]))
+        drops = np.flatnonzero(open_ & (full > limits[each, last]))
+        # Into the first slot that is not taken: there is one, for the others do not span it.
+        slot = held[joins].argmin(axis=1)
+        normals[joins, slot], multipliers[joins, slot] = normal[joins], weight[joins]
+        active[joins, slot] = entering[joins]
+        entering[joins], weight[joins] = -1, 0.0
+        slot = last[drops]
+        normals[drops, slot], multipliers[drops, slot], active[drops, slot] = 0.0, 0.0, -1
+    return point, solved

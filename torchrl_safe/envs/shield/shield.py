@@ -1,0 +1,293 @@
+"""Changes actions as little as needed to keep the arm off what is around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_safe._checks import check_kind, check_not_negative, check_positive
+from torchrl_safe.envs.physics.simulator import Simulator
+from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.shield.projection import project
+from torchrl_safe.envs.state import ArmState, Array
+from torchrl_safe.envs.vectors import cross
+
+# The nearest point of a shape may be another one at the end of a control step, and the way is
+# curved: for each radian that the joints turn, a distance can be off by this much, m.
+_ERROR = 0.1
+# Of what the joints hardly move, m/rad, and of joints without limits, rad.
+_SHORTEST, _FAR = 1e-3, 1e3
+
+
+class Shielded(NamedTuple):
+    """What a shield lets the motors do."""
+
+    #: Joint targets, rad, ``(N, n)``.
+    joints: Array
+    #: Finger targets, m, as they came, or where the fingers are.
+    fingers: Array
+    #: Which worlds hold still because nothing else is safe, ``(N,)``.
+    braked: NDArray[np.bool_]
+
+
+class _Pairs(NamedTuple):
+    """What is near the arm: k worlds with r pairs each, see :class:`Nearest`."""
+
+    #: Distance above the margin, m, ``(k, r)``; infinite where there is no pair.
+    room: Array
+    #: By how much the obstacle will shrink it in the next step, m, ``(k, r)``; not negative.
+    closing: Array
+    #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
+    joints: Array
+    fingers: Array
+    #: Numbers of the obstacles, ``(r,)``.
+    other: NDArray[np.int_]
+
+    def of(self, rows: NDArray[np.int_]) -> _Pairs:
+        """Those of some worlds."""
+        return _Pairs(
+            self.room[rows], self.closing[rows], self.joints[rows], self.fingers[rows], self.other
+        )
+
+
+class _Step(NamedTuple):
+    """The control step that begins."""
+
+    state: ArmState
+    simulator: Simulator
+    #: s.
+    duration: float
+    #: Of what is left of a distance, the share that may be used up.
+    share: float
+
+
+@dataclass(frozen=True)
+class Shield:
+    r"""Filters actions so that the arm touches neither obstacles nor the table.
+
+    Before each control step it measures every convex shape of the arm against every obstacle and
+    the table, and takes the joint targets :math:`q + x` nearest to those asked for,
+    :math:`q + w`, with which no distance d shrinks faster than a rate times what is left of it
+    above a margin, a control barrier function in discrete time (Ames et al. 2019, arXiv
+    1903.11199; Agrawal and Sreenath 2017, RSS):
+
+    .. math::
+        \min_x |x - w|^2 \quad\text{such that}\quad
+        \nabla d_i^\top x - c_i \ge -(1 - e^{-\text{rate} \cdot T}) (d_i - \text{margin})
+        \quad\text{for all } i, \qquad l \le x \le u
+
+    T is the duration of the control step, c how far the obstacle comes nearer in it. The bounds l
+    and u keep joints within their limits and speeds, and within what motors can follow: a joint's
+    velocity changes by no more than ``acceleration`` allows, or by no more than takes up the room
+    that is left, whichever is more. So far from everything the shield changes nothing. The solver
+    is exact; what is linear in it is checked: where the end of the step could be too near, the
+    distances there are measured too, and become inequalities of a second problem. If there is no
+    solution, the arm holds still, which the key ``shield_braked`` says.
+
+    **What it guarantees.** Fixed obstacles and the table are never touched, if
+
+    - the episode begins with all of them further away than their margins,
+    - motors follow targets whose velocity changes by no more than ``acceleration``, to within the
+      margin,
+    - ``reach`` is enough to stop in from the arm's largest speed,
+    - and within a control step the arm does not turn so far that a shape comes near in its middle
+      and leaves again: the distances at both ends are checked, those between follow from them to
+      within the same margin.
+
+    With obstacles that move, their velocity counts: the arm gives way as far as its joints allow.
+    As their future is unknown, the guarantee is another: the arm is not the one that moves into
+    contact, if they do not become faster than ``obstacle_speed``. The arm's own links and what its
+    gripper holds are not looked at.
+
+    **What is learnt from.** The batch holds the action that the policy sampled, and its
+    log-probability. The shield is a part of the environment: it maps state and action to joint
+    targets, as inverse kinematics and motors do, so the policy gradient is that of the shielded
+    environment, unbiased. The executed action has no density under the policy (the filter maps many
+    actions onto the same edge), which is why it is not put in the batch's place. A policy can come
+    to lean on the shield; :class:`~torchrl_safe.envs.ShieldCorrection` is the cost against that.
+
+    Args:
+        margin: distance that the arm keeps from obstacles, m.
+        rate: largest rate at which what is left above the margin shrinks, 1/s. Smaller slows down
+            from further away.
+        table: distance that the arm keeps from the table, m.
+        reach: distance up to which is measured, m. A larger one takes longer.
+        acceleration: what motors can follow, rad/s^2: within it joints arrive where they are told
+            to.
+        obstacle_speed: if given, obstacles are taken to come as fast as that at any time, m/s,
+            however slow they are now: the arm stops before they could touch it while it moves.
+            ``None`` counts on the velocity that they have.
+        workspace: if given, where the tool point has to stay; it slows down before the walls.
+
+    Raises:
+        TypeError: if ``workspace`` is not a Region.
+        ValueError: if a number is negative or not finite, or ``reach`` is not larger than both
+            margins.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> env = ArmEnv(num_envs=2, shield=Shield(margin=0.03), seed=0)
+        >>> rollout = env.rollout(3)
+        >>> rollout["next", "shield_correction"].shape, rollout["next", "shield_braked"].dtype
+        (torch.Size([2, 3, 1]), torch.bool)
+        >>> env.close()
+    """
+
+    margin: float = 0.02
+    rate: float = 5.0
+    table: float = 0.01
+    reach: float = 0.3
+    acceleration: float = 10.0
+    obstacle_speed: float | None = None
+    workspace: Region | None = None
+
+    def __post_init__(self) -> None:
+        check_not_negative(margin=self.margin, table=self.table)
+        check_positive(rate=self.rate, reach=self.reach, acceleration=self.acceleration)
+        if self.reach <= max(self.margin, self.table):
+            raise ValueError(
+                f"reach must be larger than margin = {self.margin} and table = {self.table}, got "
+                f"{self.reach}."
+            )
+        if self.obstacle_speed is not None:
+            check_not_negative(obstacle_speed=self.obstacle_speed)
+        if self.workspace is not None:
+            check_kind("workspace", self.workspace, Region)
+
+    def __call__(
+        self,
+        joints: Array,
+        fingers: Array,
+        state: ArmState,
+        simulator: Simulator,
+        *,
+        longest: Array,
+        duration: float,
+    ) -> Shielded:
+        """Returns the targets nearest to those asked for that keep the arm safe.
+
+        Args:
+            joints: joint targets that are asked for, rad, ``(N, n)``.
+            fingers: finger targets, m, ``(N, f)``, or ``(N, 0)`` where they are not driven.
+            state: the current state.
+            simulator: measures distances.
+            longest: how far the joints can turn in a control step, rad, ``(n,)``.
+            duration: of the control step, s.
+        """
+        angles, held = state.joint_position, state.finger_position
+        opening = fingers - held if fingers.shape[1] else np.zeros_like(held)
+        step = _Step(state, simulator, duration, 1 - np.exp(-self.rate * duration))
+        asked = joints - angles
+        now = self._measure(step, np.arange(len(angles)), angles, held)
+        lower, upper = self._bounds(step, now, longest)
+        least = self._least(step, now)
+        if opening.any():
+            least = least - (now.fingers @ opening[:, :, None])[:, :, 0]
+        least = _attainable(now.joints, least, lower, upper)
+        rows, least = self._with_walls(step, now.joints, least)
+        change, solved = project(asked, rows, least, lower, upper)
+        # Where the end of the step could be too near, that is measured as well.
+        left = now.room - now.closing + (now.joints @ change[:, :, None])[:, :, 0]
+        doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
+        again = np.flatnonzero(solved & doubt)
+        if len(again):
+            then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
+            turned = (then.joints @ change[again][:, :, None])[:, :, 0]
+            needed = _needed(step, now.of(again), then) + turned
+            needed = _attainable(then.joints, needed, lower[again], upper[again])
+            change[again], solved[again] = project(
+                asked[again],
+                np.concatenate([rows[again], then.joints], axis=1),
+                np.concatenate([least[again], needed], axis=1),
+                lower[again],
+                upper[again],
+            )
+        still = ~solved[:, None]
+        if fingers.shape[1]:
+            fingers = np.where(still, held, fingers)
+        return Shielded(np.where(still, angles, angles + change), fingers, ~solved)
+
+    def _measure(
+        self, step: _Step, rows: NDArray[np.int_], angles: Array, fingers: Array
+    ) -> _Pairs:
+        """Measures some worlds, with their arms where they are or will be."""
+        state, count = step.state, angles.shape[1]
+        near = step.simulator.nearest(rows, angles, fingers)
+        table = state.obstacle_position.shape[1]
+        room = near.distance - np.where(near.other == table, self.table, self.margin)
+        closing = np.zeros_like(room)
+        # Mostly nothing moves, and there is nothing to work out.
+        if state.obstacle_velocity.any() or state.obstacle_angular_velocity.any():
+            which = np.minimum(near.other, table - 1)
+            position, velocity, spin = (
+                part[rows][:, which]
+                for part in (
+                    state.obstacle_position,
+                    state.obstacle_velocity,
+                    state.obstacle_angular_velocity,
+                )
+            )
+            arm = near.point - position
+            arm -= np.where(np.isfinite(near.distance), near.distance, 0.0)[..., None] * near.normal
+            speed = ((velocity + cross(spin, arm)) * near.normal).sum(axis=2)
+            # What goes away may stop at any time.
+            closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
+        return _Pairs(
+            room, closing, near.jacobian[..., :count], near.jacobian[..., count:], near.other
+        )
+
+    def _least(self, step: _Step, now: _Pairs) -> Array:
+        """By how much each distance has to change at least, m, ``(N, r)``."""
+        least = now.closing - step.share * now.room
+        if self.obstacle_speed is None:
+            return least
+        moves = now.other < step.state.obstacle_position.shape[1]
+        come = step.duration * self.obstacle_speed * moves
+        return np.maximum(least, np.minimum(come - step.share * now.room, 0))
+
+    def _bounds(self, step: _Step, now: _Pairs, longest: Array) -> tuple[Array, Array]:
+        """How far the joints may turn, rad, each ``(N, n)``."""
+        state = step.state
+        angles, turning = state.joint_position, state.joint_velocity * step.duration
+        lower = np.clip(state.joint_lower - angles, -longest, longest)
+        upper = np.clip(state.joint_upper - angles, -longest, longest)
+        # A joint that is not where it is told to be is off by less than its velocity was to change.
+        # So all together change no distance by more than is left of it.
+        levers = np.maximum(np.abs(now.joints).sum(axis=2), _SHORTEST)
+        slack = (np.maximum(now.room, 0) / levers).min(axis=1, initial=np.inf)
+        slack = np.maximum(slack, self.acceleration * step.duration**2)[:, None]
+        return (
+            np.clip(turning - slack, np.maximum(lower, -_FAR), upper),
+            np.clip(turning + slack, lower, np.minimum(upper, _FAR)),
+        )
+
+    def _with_walls(self, step: _Step, rows: Array, least: Array) -> tuple[Array, Array]:
+        """Adds the inequalities that keep the tool point in the workspace."""
+        if self.workspace is None:
+            return rows, least
+        tool, walls = step.state.ee_position, self.workspace
+        linear = step.simulator.jacobian(step.state.joint_position)[:, :3]
+        room = np.concatenate([tool - walls.low, walls.high - tool], axis=1)
+        return (
+            np.concatenate([rows, linear, -linear], axis=1),
+            np.concatenate([least, -step.share * room], axis=1),
+        )
+
+
+def _needed(step: _Step, now: _Pairs, then: _Pairs) -> Array:
+    """How much further apart each pair at the end of a step has to be than it is, m, ``(k, r)``."""
+    # Each shape may use up what the nearest one may.
+    room = np.full((len(now.room), now.other.max(initial=0) + 1), np.inf)
+    for other in range(room.shape[1]):
+        room[:, other] = now.room[:, now.other == other].min(axis=1, initial=np.inf)
+    kept = (1 - step.share) * np.where(np.isfinite(room), room, 0.0)
+    return kept[:, then.other] + then.closing - then.room
+
+
+def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
+    """Asks for no more than half of what the joints can do: else for not coming nearer."""
+    best = np.where(rows > 0, rows * upper[:, None], rows * lower[:, None]).sum(axis=2)
+    return np.minimum(least, np.maximum(best / 2, 0))
