@@ -10,7 +10,6 @@ from worlds import ENGINES, turntable_settings
 
 from torchrl_safe.envs import ArmEnv
 
-
 # A shell that runs us in the background has us ignore Ctrl+C, and so all that we start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

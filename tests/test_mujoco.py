@@ -74,8 +74,8 @@ def play(env, steps, seed=0, first=0):
 
 def numbers(state):
     """All that an ArmState tells of each world, ``(N, width)``."""
-    shared = ("joint_lower", "joint_upper", "obstacle_size", "trace")
-    parts = [part for name, part in vars(state).items() if name not in shared]
+    others = ("joint_lower", "joint_upper", "obstacle_size", "trace", "previous")
+    parts = [part for name, part in vars(state).items() if name not in others and part is not None]
     parts += state.trace.values()
     return np.concatenate([np.reshape(part, (len(state.goal), -1)) for part in parts], axis=1)
 

@@ -56,7 +56,9 @@ def fields(env):
     named = {**vars(state), **{f"trace {name}": part for name, part in state.trace.items()}}
     del named["trace"], named["previous"]
     return {
-        name: np.abs(part) if name.endswith("orientation") else part for name, part in named.items()
+        name: np.abs(part) if name.endswith("orientation") else part
+        for name, part in named.items()
+        if part is not None
     }
 
 

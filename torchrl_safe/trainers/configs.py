@@ -67,6 +67,7 @@ class ArmEnvConfig(EnvLibsConfig):
     max_episode_steps: int = 40
     scene: Any = field(default_factory=partial(_of, "torchrl_safe.envs.Scene"))
     physics: Any = field(default_factory=partial(_of, "torchrl_safe.envs.Bullet"))
+    shield: Any = None
     seed: int | None = None
     device: Any = None
     gui: bool = False
