@@ -16,7 +16,6 @@ from itertools import islice
 from typing import Any
 
 import torch
-import tyro
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
@@ -25,7 +24,7 @@ from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, Training
-from experiments.config import AlgorithmName, Config
+from experiments.config import AlgorithmName, Config, command_line
 from experiments.files import is_new, write_whole
 from experiments.grid import side_by_side
 from experiments.log import Log, figures, score, summed_costs, versions
@@ -35,29 +34,36 @@ from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import (
     PAPER_CARTESIAN,
     PAPER_JOINT,
+    SUITE,
     ActionMode,
     ArmEnv,
     Bullet,
     CartesianDelta,
     Collision,
+    ContactForce,
     FullObservation,
     Human,
     InFront,
     JointDelta,
+    JointLimit,
     Moving,
     MuJoCo,
     NoObstacles,
     Obstacles,
     Physics,
     PickAndPlace,
+    Proximity,
     Push,
     Reach,
     Scattered,
+    Speed,
+    SpeedAndSeparation,
     Task,
     gym,
     paper_env,
     paper_observation,
 )
+from torchrl_safe.envs.arm_env import Cost
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.policy import save_policy
 
@@ -78,7 +84,15 @@ OBSTACLES: dict[str, Obstacles] = {
 PHYSICS: dict[str, Physics] = {"bullet": Bullet(), "mujoco": MuJoCo()}
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
-COSTS = {"collision": Collision()}
+COSTS: dict[str, Cost] = {
+    "collision": Collision(),
+    "contact-force": ContactForce(),
+    "joint-limit": JointLimit(),
+    "proximity": Proximity(),
+    "separation": SpeedAndSeparation(),
+    # Actions ask for up to 1 m/s along each axis.
+    "speed": Speed(limit=1.0),
+}
 # What may be another when a run is resumed: it changes nothing in what is learnt.
 CHANGEABLE = ("algorithms", "shield", "jobs", "out", "logger", "resume", "checkpoint_every")
 
@@ -97,7 +111,6 @@ def make_env(
     The sums, over each episode, are of what the arm has earned and cost, whatever an algorithm
     makes of it.
     """
-    task, steps = TASKS[config.task]
     settings: dict[str, Any] = {
         "observation": OBSERVATIONS[config.observation],
         "num_envs": num_envs,
@@ -110,20 +123,30 @@ def make_env(
         env = paper_env(PAPER_ACTIONS[config.action], **settings)
     else:
         env = ArmEnv(
-            ARMS[config.arm],
-            action=make_action(config),
-            task=task,
-            obstacles=OBSTACLES[config.obstacles],
-            costs=COSTS,
             physics=PHYSICS[config.physics],
             shield=ALGORITHMS[algorithm].shield,
-            **{"max_episode_steps": steps, **settings},
+            **{**arm_arguments(config), **settings},
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = ALGORITHMS[algorithm].transforms(config)
     if training:
         transforms += ALGORITHMS[algorithm].training_transforms(config)
     return TransformedEnv(env, Compose(sums, *transforms))
+
+
+def arm_arguments(config: Config) -> dict[str, Any]:
+    """What the arm, its task and its costs are, as arguments of ArmEnv."""
+    if config.suite_task is not None:
+        return SUITE[config.suite_task].arguments
+    task, steps = TASKS[config.task]
+    return {
+        "arm": ARMS[config.arm],
+        "action": make_action(config),
+        "task": task,
+        "obstacles": OBSTACLES[config.obstacles],
+        "costs": {name: COSTS[name] for name in config.cost_limits},
+        "max_episode_steps": steps,
+    }
 
 
 def make_action(config: Config) -> ActionMode:
@@ -187,6 +210,7 @@ def train(
     env.close()
     log = Log(config.logger, config.out / "logs", algorithm)
     batches = math.ceil(config.frames / config.frames_per_batch)
+    costs = tuple(config.cost_limits)
     with (
         collecting(config, training.collector, algorithm) as collector,
         tqdm(
@@ -222,13 +246,13 @@ def train(
             training.learner.learn(batch)
             collector.update_policy_weights_()
             bar.update(batch.numel())
-            row = figures(episodes, training.loss, tuple(COSTS))
-            row |= summed_costs(batch, log.rows, tuple(COSTS))
+            row = figures(episodes, training.loss, costs)
+            row |= summed_costs(batch, log.rows, costs)
             bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
             log.add({"frames": log.frames + batch.numel(), **row})
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
                 recent = log.rows[-config.checkpoint_every :]
-                checkpoints.save(log.frames, score=score(recent, config.cost_limit))
+                checkpoints.save(log.frames, score=score(recent, config.cost_limits))
     keep_policy(config, algorithm, training)
     return training.actor, log
 
@@ -258,7 +282,7 @@ def train_and_evaluate(
         "versions": versions(),
         "seconds": seconds,
         "history": log.rows,
-        "evaluation": summarize(episodes, tuple(COSTS)),
+        "evaluation": summarize(episodes, tuple(config.cost_limits)),
         "episodes": {name: value.tolist() for name, value in episodes.items()},
     }
 
@@ -271,7 +295,11 @@ def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
 def start(config: Config) -> dict[str, Any]:
     """Begins a run, or reads what one that is resumed has finished."""
     path = config.out / "results.json"
-    results: dict[str, Any] = {"config": dataclasses.asdict(config), "algorithms": {}}
+    results: dict[str, Any] = {
+        "config": dataclasses.asdict(config),
+        "cost_limits": config.cost_limits,
+        "algorithms": {},
+    }
     if config.resume and path.exists():
         before = json.loads(path.read_text())
         refuse_other_settings(settings(before["config"]), settings(results["config"]))
@@ -328,4 +356,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(command_line())
