@@ -7,13 +7,12 @@ and it can tell what is right wherever that network has got to (:mod:`experiment
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from torchrl_safe.envs import IIWA, PANDA, UR5, UR10, XARM6, XARM7, ArmEnv, ArmState
+from torchrl_safe.envs import ArmEnv, ArmState, CartesianDelta, PickAndPlace, Push, Reach, Task
 from torchrl_safe.envs.state import Array
 
 # Where the fingers' ends, 1 cm below the tool point, take the upper half of a cube, m.
@@ -22,23 +21,6 @@ _LOW = 0.033
 _OVER, _ABOVE_TABLE = 0.13, 0.12
 # Share of the largest action: a policy that squashes its output can give it.
 _SHARE = 0.9
-
-_LEFT, _RIGHT = (
-    (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
-    (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),
-)
-_LEANING = (0.0, math.cos(0.3), 0.0, math.sin(0.3))
-#: Orientations of the tool that keep each arm off an obstacle beside the object. Turned by a
-#: quarter, the hand shows it its narrow side; to which side, decides where the elbow of an arm
-#: with seven joints goes. The wrist of a UR hangs too low for that: leaning, it stays back.
-ORIENTATIONS = {
-    PANDA: _RIGHT,
-    IIWA: _RIGHT,
-    XARM6: _RIGHT,
-    XARM7: _LEFT,
-    UR5: _LEANING,
-    UR10: _LEANING,
-}
 
 
 class Pilot(Protocol):
@@ -59,8 +41,23 @@ def act(env: ArmEnv, pilot: Pilot) -> Array:
 
 
 @dataclass(frozen=True)
+class ReachPilot:
+    """Up, over everything, and down to the goal."""
+
+    def __call__(self, state: ArmState) -> tuple[Array, Array]:
+        top = np.maximum(_safe_height(state), state.goal[:, 2])
+        return _from_above(state.ee_position, state.goal, top), np.zeros(len(state.goal))
+
+
+@dataclass(frozen=True)
 class PickAndPlacePilot:
-    """From above to the object, over everything to the goal, and down."""
+    """From above to the object, over everything to the goal, and down.
+
+    Args:
+        slack: how much too low the object still may be when it is carried sideways, m.
+    """
+
+    slack: float = 0.0
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
         tool, place = state.ee_position, state.object_position[:, 0]
@@ -69,8 +66,10 @@ class PickAndPlacePilot:
         near = (_length(from_object[:, :2]) < 0.012) & (np.abs(tool[:, 2] - _LOW) < 0.012)
         opening = state.finger_position.mean(axis=1)
         held = (_length(from_object) < 0.03) & (opening < 0.024)
-        pick = _from_above(tool, np.column_stack([place[:, :2], np.maximum(_LOW, place[:, 2])]), top)
-        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]))
+        pick = _from_above(
+            tool, np.column_stack([place[:, :2], np.maximum(_LOW, place[:, 2])]), top
+        )
+        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]), self.slack)
         target = np.where(held[:, None], put, pick)
         return target, np.where(held | near, 0.0, 1.0)
 
@@ -84,7 +83,7 @@ class PushPilot:
             x, where the hand is wide, and y.
     """
 
-    room: tuple[float, float] = (0.2, 0.13)
+    room: tuple[float, float] = (0.22, 0.15)
     speed: float = 0.02
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
@@ -99,7 +98,9 @@ class PushPilot:
         angle = np.arctan2(side, -along)
         low = (tool[:, 2] < 0.065) & (distance < 0.12)
         behind = place[:, :2] - 0.06 * ahead
-        above = _from_above(tool, np.column_stack([behind, np.full(len(tool), _LOW)]), _safe_height(state))
+        above = _from_above(
+            tool, np.column_stack([behind, np.full(len(tool), _LOW)]), _safe_height(state)
+        )
         # Around the object at the table, until it is behind it.
         sign = np.sign(angle)
         turn = angle - sign * np.minimum(np.abs(angle), 0.6)
@@ -138,12 +139,33 @@ class PushPilot:
         return np.where(blocked[:, None], detour, course)
 
 
-def _from_above(tool: Array, place: Array, top: Array) -> Array:
+PILOTS: dict[type[Task], Pilot] = {
+    Reach: ReachPilot(),
+    Push: PushPilot(),
+    PickAndPlace: PickAndPlacePilot(),
+}
+
+
+def make_pilot(env: ArmEnv) -> Pilot:
+    """Makes the pilot of an environment's task.
+
+    Raises:
+        ValueError: if the task has none, or its actions do not move the tool.
+    """
+    if not isinstance(env.action_mode, CartesianDelta):
+        raise ValueError(f"demonstrations need Cartesian actions, got {env.action_mode}.")
+    for task, pilot in PILOTS.items():
+        if isinstance(env.task, task):
+            return pilot
+    raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
+
+
+def _from_above(tool: Array, place: Array, top: Array, slack: float = 0.0) -> Array:
     """The next stop on the way up, over and down to a place."""
     off = _length(tool[:, :2] - place[:, :2])
     floor = np.minimum(top, place[:, 2] + 5 * np.maximum(0, off - 0.012))
     # Sideways only as far as it is high enough.
-    free = np.clip(1 - (floor - tool[:, 2]) / 0.05, 0, 1)[:, None]
+    free = np.clip(1 - (floor - tool[:, 2] - slack) / 0.05, 0, 1)[:, None]
     flat = tool[:, :2] + free * (place - tool)[:, :2]
     return np.column_stack([flat, floor])
 
