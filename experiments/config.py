@@ -246,8 +246,8 @@ class Config:
 
 
 _HANDLING = {
-    "demonstrations": 65_536,
-    "frames": 262_144,
+    "demonstrations": 98_304,
+    "frames": 196_608,
     "envs": 64,
     "frames_per_batch": 4096,
     "minibatch": 512,
