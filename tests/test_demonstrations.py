@@ -107,7 +107,7 @@ def test_critics_are_fitted_and_the_policy_stays():
 def test_every_algorithm_starts_from_the_same_policy():
     weights = []
     for algorithm in ("ppo-lagrangian", "cpo"):
-        training, env, config = make_training(algorithm)
+        training, env, config = make_training(algorithm, episode_steps=20)
         start_from_demonstrations(training, env, config)
         env.close()
         weights.append(training.actor.state_dict())
@@ -130,7 +130,8 @@ def test_acting_is_random_and_goes_on():
 
 def test_a_run_that_goes_on_is_the_run_that_was_not_stopped(tmp_path):
     """It does not begin with demonstrations again."""
-    settings = {**SMALL, "frames": 192, "frames_per_batch": 64, "epochs": 1, "checkpoint_every": 1}
+    short = {"frames": 128, "frames_per_batch": 64, "epochs": 1, "episode_steps": 20}
+    settings = {**SMALL, **short, "checkpoint_every": 1}
     whole, part = tmp_path / "whole", tmp_path / "part"
     expected = train(Config(**settings, out=whole), "ppo", progress=False)
     train(Config(**settings, out=part), "ppo", progress=False)
