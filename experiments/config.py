@@ -180,6 +180,11 @@ class Config:
                 raise ValueError(
                     f"algorithms must not contain {name} with paper: it needs bounded actions."
                 )
+            if name in ("cpo", "pcpo") and len(self.cost_limits) > 1:
+                raise ValueError(
+                    f"algorithms must not contain {name} with several costs, got "
+                    f"{', '.join(self.cost_limits)}: it limits one."
+                )
             if name == "ppo-saute" and not all(self.cost_limits.values()):
                 limits = ", ".join(f"{cost} {limit:g}" for cost, limit in self.cost_limits.items())
                 raise ValueError(f"cost_limit must be positive with ppo-saute, got {limits}.")
