@@ -89,6 +89,9 @@ class Config:
     of the tool above 1 m/s; the others are as the library has them by default."""
     frames: int = 128_000
     """Control steps to train for, with each algorithm."""
+    demonstrations: int = 0
+    """Control steps before the training in which a scripted pilot says what to do, and the policy
+    learns to do it."""
     envs: int = 32
     """Simulated worlds, shared among the workers."""
     workers: int | None = None
@@ -161,6 +164,8 @@ class Config:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
         if not 0 < self.gamma < 1:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
+        if self.demonstrations < 0:
+            raise ValueError(f"demonstrations must not be negative, got {self.demonstrations}.")
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
         for cost, limit in self.costs.items():
@@ -184,6 +189,11 @@ class Config:
                 raise ValueError(
                     f"algorithms must not contain {name} with several costs, got "
                     f"{', '.join(self.cost_limits)}: it limits one."
+                )
+            if self.demonstrations and name in OFF_POLICY:
+                raise ValueError(
+                    f"demonstrations must be 0 with {name}, which learns off policy, got "
+                    f"{self.demonstrations}."
                 )
             if name == "ppo-saute" and not all(self.cost_limits.values()):
                 limits = ", ".join(f"{cost} {limit:g}" for cost, limit in self.cost_limits.items())
@@ -235,8 +245,21 @@ class Config:
         return 1 if self.physics == "bullet" else os.cpu_count() or 1
 
 
+_HANDLING = {
+    "demonstrations": 65_536,
+    "frames": 262_144,
+    "envs": 64,
+    "frames_per_batch": 4096,
+    "minibatch": 512,
+    "hidden": 128,
+    "learning_rate": 3e-4,
+    "first_log_std": -1.7,
+    "last_log_std": -2.5,
+}
+#: The kinds of task, by the names that options give them.
+TASKS: dict[str, type] = {"reach": Reach, "push": Push, "pick-and-place": PickAndPlace}
 # What differs between reaching, pushing and picking up; within a kind of task nothing does.
-KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: {}, PickAndPlace: {}}
+KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: _HANDLING, PickAndPlace: _HANDLING}
 
 
 def suite_config(name: SuiteTaskName, **others: Any) -> Config:
@@ -260,6 +283,10 @@ def command_line(arguments: Sequence[str] | None = None) -> Config:
     """Reads the options; what is not given is what the task of the suite has, if one is named."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--suite-task", "--suite_task", choices=[*SUITE])
+    first.add_argument("--task", default="reach")
     known, _ = first.parse_known_args(arguments)
-    default = None if known.suite_task is None else suite_config(known.suite_task)
+    if known.suite_task is not None:
+        default = suite_config(known.suite_task)
+    else:
+        default = Config(**KINDS[TASKS.get(known.task, Reach)])
     return tyro.cli(Config, args=arguments, default=default)

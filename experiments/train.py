@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, Training
 from experiments.config import AlgorithmName, Config, command_line
+from experiments.demonstrations import start_from_demonstrations
 from experiments.files import is_new, write_whole
 from experiments.grid import side_by_side
 from experiments.log import Log, figures, score, summed_costs, versions
@@ -70,7 +71,7 @@ from torchrl_safe.policy import save_policy
 # The tasks, with control steps enough for an episode.
 TASKS: dict[str, tuple[Task, int]] = {
     "reach": (Reach(), 40),
-    "push": (Push(), 100),
+    "push": (Push(), 200),
     "pick-and-place": (PickAndPlace(), 100),
 }
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
@@ -151,11 +152,14 @@ def arm_arguments(config: Config) -> dict[str, Any]:
 
 def make_action(config: Config) -> ActionMode:
     """Makes what an action does, as the task needs it."""
+    if config.task == "reach":
+        return JointDelta() if config.action == "joint" else CartesianDelta()
     fingers = 0.04 if config.task == "pick-and-place" else None
     if config.action == "joint":
         return JointDelta(finger_step=fingers)
     # As fast as an arm may reach, 1 m/s, a cube that is hit slides on for 0.2 m.
-    return CartesianDelta(step=0.05 if config.task == "reach" else 0.03, finger_step=fingers)
+    held = ARMS[config.arm].handling_orientation
+    return CartesianDelta(step=0.03, orientation=held, finger_step=fingers)
 
 
 @contextmanager
@@ -233,10 +237,11 @@ def train(
             },
             settings={"algorithm": algorithm, **settings(dataclasses.asdict(config))},
         )
-        if config.resume:
-            checkpoints.load()
-        else:
+        if not config.resume:
             checkpoints.clear()
+        if checkpoints.load() is None and config.demonstrations:
+            demonstrate(config, algorithm, training)
+            collector.update_policy_weights_()
         log.open()
         bar.update(log.frames)
         for batch in islice(collector, batches - len(log.rows)):
@@ -255,6 +260,14 @@ def train(
                 checkpoints.save(log.frames, score=score(recent, config.cost_limits))
     keep_policy(config, algorithm, training)
     return training.actor, log
+
+
+def demonstrate(config: Config, algorithm: AlgorithmName, training: Training) -> None:
+    """Starts policy and critics from demonstrations, in episodes that nothing else uses."""
+    seed = config.seed + 2_000_000
+    env = make_env(config, config.envs, seed, algorithm, training=True)
+    start_from_demonstrations(training, env, config)
+    env.close()
 
 
 def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) -> None:

@@ -119,8 +119,12 @@ _ONE_TOUCH = {"collision": Collision()}
 _BESIDE_A_PERSON = {"collision": Collision(), "separation": SpeedAndSeparation()}
 # Who hardly waits is there before the arm has passed.
 _BUSY_PERSON = Human(pause=(0.05, 0.3))
-_SLOW = CartesianDelta(step=0.03)
-_WITH_FINGERS = CartesianDelta(step=0.03, finger_step=0.04)
+
+
+def _handling(arm: ArmModel, finger_step: float | None = None) -> CartesianDelta:
+    """What moves an object: slowly, or it slides on, and out of the way of what is beside it."""
+    return CartesianDelta(step=0.03, orientation=arm.handling_orientation, finger_step=finger_step)
+
 
 #: The tasks by their names, which are registered with Gymnasium as ``torchrl_safe/<name>-v0``.
 SUITE: dict[str, SuiteTask] = {
@@ -167,8 +171,8 @@ SUITE: dict[str, SuiteTask] = {
             InFront(),
             _ONE_TOUCH,
             {"collision": 0.5},
-            _SLOW,
-            max_episode_steps=100,
+            _handling(XARM6),
+            max_episode_steps=200,
         ),
         SuiteTask(
             "panda-push-human",
@@ -177,8 +181,8 @@ SUITE: dict[str, SuiteTask] = {
             Human(),
             _BESIDE_A_PERSON,
             {"collision": 0.5, "separation": 2.0},
-            _SLOW,
-            max_episode_steps=100,
+            _handling(PANDA),
+            max_episode_steps=200,
         ),
         SuiteTask(
             "panda-pick-in-front",
@@ -187,7 +191,7 @@ SUITE: dict[str, SuiteTask] = {
             InFront(),
             _ONE_TOUCH,
             {"collision": 0.5},
-            _WITH_FINGERS,
+            _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
         ),
         SuiteTask(
@@ -200,7 +204,7 @@ SUITE: dict[str, SuiteTask] = {
                 "contact-force": ContactForce(),
             },
             {"workspace": 0.5, "contact-force": 0.5},
-            _WITH_FINGERS,
+            _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
         ),
         SuiteTask(
@@ -210,7 +214,7 @@ SUITE: dict[str, SuiteTask] = {
             Scattered(count=3, fewest=1),
             _ONE_TOUCH,
             {"collision": 0.5},
-            _WITH_FINGERS,
+            _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
         ),
     )
