@@ -16,7 +16,7 @@ NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrai
 	trust_region_optimum trust_region_step violation))
 
 .PHONY: train test test-kernels test-slow test-wheel test-safety-gymnasium safe-gym safe-gym-grid \
-	bench-omnisafe compare paper sweep profile gallery bench draws attack ray docs lint format type clean
+	bench-omnisafe compare suite paper sweep profile gallery bench draws attack ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -53,6 +53,9 @@ test-wheel:  ## the package as people get it: an empty environment, with and wit
 
 compare: $(READY)  ## every algorithm on the same task; goes on where it was stopped
 	$(BIN)/python -m experiments.compare $(ARGS)
+
+suite: $(READY)  ## ten tasks with their limits, five seeds; goes on where it was stopped
+	$(BIN)/python -m experiments.suite $(ARGS)
 
 paper: $(READY)  ## Table 1 and Figure 2 of the paper, run again; goes on where it was stopped
 	$(BIN)/python -m experiments.paper $(ARGS)

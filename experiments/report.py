@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,10 @@ COLOURS = ("tab:orange", "tab:blue", "tab:green", "tab:purple")
 def table(results: dict[str, Any]) -> str:
     """Returns a Markdown table: a row for each algorithm, estimates with 95 % intervals."""
     rows = {name: run["evaluation"] for name, run in results["algorithms"].items()}
-    return figures_table(rows, [results["config"]["cost_limit"]])
+    return figures_table(rows, results["cost_limits"])
 
 
-def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Sequence[float]) -> str:
+def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Mapping[str, float]) -> str:
     """Returns a Markdown table of named rows of figures, each with its interval or without."""
     columns = list(next(iter(rows.values())))
     lines = [
@@ -39,8 +39,12 @@ def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Sequence
     for name, row in rows.items():
         cells = (_cell(*row[column], share=_is_share(column)) for column in columns)
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    limits = ", ".join(f"{limit:g}" for limit in cost_limits)
-    lines.append(f"\nCost limit {limits}; brackets: 95 % confidence.")
+    if len(cost_limits) == 1:
+        (limit,) = cost_limits.values()
+        shown = f"limit {limit:g}"
+    else:
+        shown = "limits " + ", ".join(f"{name} {limit:g}" for name, limit in cost_limits.items())
+    lines.append(f"\nCost {shown}; brackets: 95 % confidence.")
     return "\n".join(lines)
 
 
@@ -85,8 +89,8 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
         kind, _, cost = key.partition("/")
         axis.set(xlabel="frames", ylabel=_CURVES[kind] + cost)
         axis.grid(alpha=0.3)
-    for axis in axes[1 : 1 + len(costs)]:
-        axis.axhline(results["config"]["cost_limit"], color="black", ls="--", label="limit")
+    for axis, limit in zip(axes[1:], results["cost_limits"].values(), strict=False):
+        axis.axhline(limit, color="black", ls="--", label="limit")
     for axis in axes[1 + len(costs) :]:
         # From none to thousands.
         axis.set_yscale("symlog", linthresh=10)
