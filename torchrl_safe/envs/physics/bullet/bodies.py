@@ -186,9 +186,7 @@ def load_body(client: int, urdf: str, position: Sequence[float]) -> int:
     return pybullet.loadURDF(_data(urdf), position, physicsClientId=client)
 
 
-def add_shape(
-    client: int, shape: Shape, position: Sequence[float], default: Colour | None
-) -> int:
+def add_shape(client: int, shape: Shape, position: Sequence[float], default: Colour | None) -> int:
     """Adds a shape; without a colour it is simulated but not drawn."""
     geometry, size = _geometry(shape)
     body = pybullet.createCollisionShape(geometry, physicsClientId=client, **size)

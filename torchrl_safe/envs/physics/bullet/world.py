@@ -448,6 +448,8 @@ class World:
             view,
             projection,
             lightDirection=(1, -1, 2),
+            # Closer lights cast no shadow.
+            lightDistance=10,
             shadow=camera.shadows,
             renderer=pybullet.ER_TINY_RENDERER,
             physicsClientId=self._client,

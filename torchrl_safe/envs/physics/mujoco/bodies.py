@@ -11,7 +11,13 @@ from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sp
 from torchrl_safe.envs.physics.mujoco.contacts import set_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.mujoco.free import TO_MUJOCO
-from torchrl_safe.envs.physics.palette import OBJECT, OBSTACLE, TABLE as TABLE_COLOUR, Colour, colour
+from torchrl_safe.envs.physics.palette import (
+    OBJECT,
+    OBSTACLE,
+    TABLE as TABLE_COLOUR,
+    Colour,
+    colour,
+)
 
 #: Name of the table's shape; its top is at height 0.
 TABLE = "table"
@@ -31,7 +37,9 @@ def thing(index: int) -> str:
 
 def add_table(spec: Any, *, reach: float) -> None:
     """Adds the table: a box, for what falls off it is to fall on."""
-    _add_geom(spec.worldbody, TABLE, _TABLE, TABLE_COLOUR, free=False, reach=reach, pos=_TABLE_PLACE)
+    _add_geom(
+        spec.worldbody, TABLE, _TABLE, TABLE_COLOUR, free=False, reach=reach, pos=_TABLE_PLACE
+    )
 
 
 def add_obstacle(spec: Any, index: int, shape: Shape, *, reach: float) -> None:

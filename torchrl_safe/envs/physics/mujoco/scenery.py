@@ -5,7 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
-from torchrl_safe.envs.physics.palette import ARM, FLOOR, GOAL as GOAL_COLOUR, GOAL_RADIUS, SKY, ring
+from torchrl_safe.envs.physics.palette import (
+    ARM,
+    FLOOR,
+    GOAL as GOAL_COLOUR,
+    GOAL_RADIUS,
+    SKY,
+    ring,
+)
 
 #: Name of the ball where the goal is, which comes after all other bodies.
 GOAL = "goal"
