@@ -79,7 +79,7 @@ gallery: $(READY)  ## the contact sheet of docs/environments.md
 	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)
 
 docs: $(READY)  ## these pages, the tutorials (run where new) and the API reference, in docs/_build
-	OMP_NUM_THREADS=1 $(BIN)/sphinx-build -qW docs docs/_build
+	OMP_NUM_THREADS=1 $(BIN)/sphinx-build -qW docs docs/_build $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

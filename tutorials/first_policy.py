@@ -172,7 +172,7 @@ for column, (axis, title) in enumerate(zip(axes, titles, strict=True)):
         axis.plot(frames, history[:, column], color=COLOURS[name], label=name)
     axis.set(title=title, xlabel="control steps")
 axes[1].axhline(COST_LIMIT, color="black", ls="--", lw=1)
-axes[1].annotate("limit", (frames[-1], COST_LIMIT), ha="right", va="bottom")
+axes[1].text(1.01, COST_LIMIT, "limit", va="center", transform=axes[1].get_yaxis_transform())
 axes[0].legend()
 figure.tight_layout()
 

@@ -138,7 +138,7 @@ for axis, values, title in zip(axes, torch.tensor(history).T, titles, strict=Tru
     axis.plot(frames, values, color="tab:green")
     axis.set(title=title, xlabel="control steps")
 axes[1].axhline(COST_LIMIT, color="black", ls="--", lw=1)
-axes[1].annotate("limit", (frames[-1], COST_LIMIT), ha="right", va="bottom")
+axes[1].text(1.01, COST_LIMIT, "limit", va="center", transform=axes[1].get_yaxis_transform())
 figure.tight_layout()
 
 for name, (middle, low, high) in summarize(evaluate(env, actor, 128, seed=1_000)).items():

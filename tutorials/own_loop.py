@@ -222,7 +222,7 @@ for axis, values, title in zip(
     axis.plot(frames, values, color="tab:blue")
     axis.set(title=title, xlabel="control steps")
 axes[1].axhline(0.5, color="black", ls="--", lw=1)
-axes[1].annotate("limit", (frames[-1], 0.5), ha="right", va="bottom")
+axes[1].text(1.01, 0.5, "limit", va="center", transform=axes[1].get_yaxis_transform())
 figure.tight_layout()
 
 # %%

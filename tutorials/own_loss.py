@@ -7,7 +7,7 @@ You write a constrained loss and two rules that move its multiplier. Tests of
 training. At the end you see both rules on a problem whose best policy is known: one circles above
 its limit, the other settles on it.
 
-This page runs in about a minute. It needs TorchRL only, no robot.
+This page runs in half a minute. It needs TorchRL only, no robot.
 """
 
 # %%
@@ -167,9 +167,9 @@ for rule in (Halving, SavedTrend):
     left.plot(cost, color=colours[name], label=f"{name}: {cost[60:].mean():.2f} in the second half")
     right.plot(multiplier[:, 0], color=colours[name], label=name)
 left.axhline(0.3, color="black", ls="--")
-left.annotate("limit", (118, 0.31), ha="right", va="bottom")
+left.text(1.01, 0.3, "limit", va="center", transform=left.get_yaxis_transform())
 right.axhline(1.0, color="black", ls="--")
-right.annotate("optimum", (118, 1.02), ha="right", va="bottom")
+right.text(1.01, 1.0, "best", va="center", transform=right.get_yaxis_transform())
 left.set(xlabel="batches", ylabel="mean cost of an episode", ylim=(0, 1))
 left.legend()
 right.set(xlabel="batches", ylabel="multiplier")

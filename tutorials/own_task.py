@@ -6,7 +6,7 @@ You write a task that no library has: follow a point that runs round a circle. Y
 not cross an invisible wall that cuts the circle. And you write what the policy sees. At the end you
 see the paths of two policies. One follows the whole circle, the other stops at the wall.
 
-It takes about a minute and a half.
+It takes about a minute.
 """
 
 # %%
@@ -237,8 +237,8 @@ for (name, actor), colour in zip(actors.items(), ("tab:orange", "tab:blue"), str
     path, cost = path_of(actor)
     axis.plot(*path[40:].T, color=colour, label=f"{name}: cost {cost:.1f}")
 axis.set(xlabel="x from the centre, m", ylabel="y from the centre, m", xlim=(-0.15, 0.15))
-axis.set(ylim=(-0.15, 0.15), aspect="equal", title="The limit keeps the tool out of the red area")
-axis.legend(loc="lower right")
+axis.set(ylim=(-0.2, 0.15), aspect="equal", title="The limit keeps the tool out of the red area")
+axis.legend(loc="lower center", ncols=3, columnspacing=1, handlelength=1)
 figure.tight_layout()
 
 # %%
