@@ -60,6 +60,7 @@ sphinx_gallery_conf = {
     "filename_pattern": r"\.py$",
     "within_subsection_order": ExplicitOrder(TUTORIALS),
     "parallel": 2,
+    "remove_config_comments": True,
     "show_memory": False,
     "download_all_examples": False,
     "write_computation_times": False,  # Their page loads scripts from elsewhere.

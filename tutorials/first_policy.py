@@ -12,6 +12,8 @@ on its collisions, and film both. This is the picture at the end:
 Both together take about a minute and a half on one core.
 """
 
+# sphinx_gallery_thumbnail_number = -1
+
 # %%
 # The environment
 # ---------------

@@ -9,6 +9,8 @@ paths: over the obstacle with one limit, and around it with two.
 Both together take about a minute and a half on one core.
 """
 
+# sphinx_gallery_thumbnail_number = -1
+
 # %%
 # Costs by name
 # -------------
