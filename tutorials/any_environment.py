@@ -63,7 +63,7 @@ gymnasium.register("Puddle-v0", Puddle, max_episode_steps=25)
 # In TorchRL
 # ----------
 #
-# :class:`~torchrl_safe.envs.gym.SafeGymEnv` is TorchRL's ``GymEnv`` with the cost beside the
+# ``SafeGymEnv`` is TorchRL's ``GymEnv`` with the cost beside the
 # reward. With ``num_envs`` it makes several. ``asynchronous=False`` steps them in this process,
 # which is faster where a step takes less than about a millisecond.
 
@@ -203,8 +203,8 @@ figure.tight_layout()
 # ---------------------
 #
 # - Move the puddle to (0, 0), so that both ways round are equally long. Which one is found?
-# - A recipe for longer runs, with checkpoints: :doc:`Train in any environment with a cost
-#   </safe_gym>`.
+# - A recipe for longer runs, with checkpoints: `Train in any environment with a cost
+#   <../safe_gym.html>`_.
 # - An environment of TorchRL that has its cost in the observation: ``CostToReward``, in
-#   :doc:`transforms </reference/transforms>`.
-# - Reference: :doc:`Gymnasium </reference/gym>`.
+#   `transforms <../reference/transforms.html>`_.
+# - Reference: `Gymnasium <../reference/gym.html>`_.

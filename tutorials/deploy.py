@@ -13,7 +13,7 @@ It takes about a minute.
 # A policy
 # --------
 #
-# This is the loop of :doc:`the first safe policy <first_policy>` with fewer steps. If you have
+# This is the loop of `the first safe policy <first_policy.html>`_ with fewer steps. If you have
 # trained a policy already, go on to the next section.
 
 import base64
@@ -249,10 +249,10 @@ for name, episodes in played.items():
 # Where to go from here
 # ---------------------
 #
-# - Put limits on what the second cost shows: :doc:`several costs, several limits
-#   <several_limits>`.
+# - Put limits on what the second cost shows: `several costs, several limits
+#   <several_limits.html>`_.
 # - ``python -m experiments.evaluate --policy policy.pt --video film.gif`` does all this for a
 #   file.
-# - What can be saved, what a file guarantees: :doc:`Deploy a policy </howto/deploy>`.
-# - Reference: :doc:`policies </reference/policy>`, :doc:`metrics </reference/metrics>`,
-#   :doc:`Gymnasium </reference/gym>`.
+# - What can be saved, what a file guarantees: `Deploy a policy <../howto/deploy.html>`_.
+# - Reference: `policies <../reference/policy.html>`_, `metrics <../reference/metrics.html>`_,
+#   `Gymnasium <../reference/gym.html>`_.

@@ -18,7 +18,7 @@ Both together take about a minute and a half on one core.
 # The environment
 # ---------------
 #
-# An :class:`~torchrl_safe.envs.ArmEnv` is put together from an arm, an action representation, a
+# An ``ArmEnv`` is put together from an arm, an action representation, a
 # task, obstacles, costs and a physics engine. Only the costs are given here. The rest are
 # defaults: a Panda that moves its tool by up to 5 cm in each step, a target to reach, one
 # obstacle in front of it. ``num_envs`` worlds run side by side.
@@ -237,8 +237,8 @@ figure.tight_layout()
 # - Change ``COST_LIMIT`` to 2, or to 0. Where does the multiplier settle?
 # - Train longer: with ``FRAMES = 128_000`` the policy is smoother and the limit is kept more
 #   surely. ``make train`` does that, and lowers the noise of the policy along the way.
-# - :doc:`The same loop, step by step <own_loop>`, with every tensor that goes through it.
-# - :doc:`Choose a limit, a discount and a rate </howto/limit>`, :doc:`the cost stays just above
-#   the limit </howto/just_above>`.
-# - Reference: :doc:`environments </reference/environments>`, :doc:`losses
-#   </reference/on_policy>`, :doc:`rules </reference/rules>`.
+# - `The same loop, step by step <own_loop.html>`_, with every tensor that goes through it.
+# - `Choose a limit, a discount and a rate <../howto/limit.html>`_, `the cost stays just above the
+#   limit <../howto/just_above.html>`_.
+# - Reference: `environments <../reference/environments.html>`_, `losses
+#   <../reference/on_policy.html>`_, `rules <../reference/rules.html>`_.

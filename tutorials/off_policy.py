@@ -4,7 +4,7 @@ Off-policy: SAC-Lagrangian with a replay buffer
 
 Where steps are expensive, you want to learn from each of them more than once. You train SAC under a
 limit on collisions, from a replay buffer of TorchRL. At the end the arm reaches its target within
-the limit, after half of the steps that PPO took in :doc:`the first safe policy <first_policy>`.
+the limit, after half of the steps that PPO took in the first tutorial.
 
 It takes about a minute and a half on one core. SAC needs fewer steps of the robot, and more
 computing for each.
@@ -150,8 +150,8 @@ for name, (middle, low, high) in summarize(evaluate(env, actor, 128, seed=1_000)
 #
 # - Train longer, with ``FRAMES = 128_000``: the policy becomes faster and the limit is kept more
 #   surely. Or learn more from each step, with ``STEPS_PER_UPDATE = 2``.
-# - Sum rewards and costs over n steps in the buffer:
-#   :doc:`Repeated actions and n-step sums </environments>`.
-# - :doc:`SAC-Lagrangian </algorithms/sac_lagrangian>`, :doc:`TD3-Lagrangian
-#   </algorithms/td3_lagrangian>`: equations and arguments.
-# - Reference: :doc:`off-policy losses </reference/off_policy>`.
+# - Sum rewards and costs over n steps in the buffer: `Repeated actions and n-step sums
+#   <../environments.html>`_.
+# - `SAC-Lagrangian <../algorithms/sac_lagrangian.html>`_, `TD3-Lagrangian
+#   <../algorithms/td3_lagrangian.html>`_: equations and arguments.
+# - Reference: `off-policy losses <../reference/off_policy.html>`_.

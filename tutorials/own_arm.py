@@ -104,7 +104,7 @@ print(Path(urdf).read_text()[:420], "...")
 # The home pose
 # -------------
 #
-# An :class:`~torchrl_safe.envs.ArmModel` is the URDF, the name of the last link, and the joint
+# An ``ArmModel`` is the URDF, the name of the last link, and the joint
 # angles at the start of an episode. Guess angles with the elbow up and the wrist down. The
 # gripper is one of ours. ``position`` puts it at the end of the flange, whose frame is 0.04 m
 # further in.
@@ -117,7 +117,7 @@ guess = ArmModel(
 )
 
 # %%
-# :func:`~torchrl_safe.envs.find_home` searches for the angles that put the tool where you want
+# ``find_home`` searches for the angles that put the tool where you want
 # it. Two things can go wrong here. Both raise a ``ValueError`` that says why. The first is a pose
 # out of reach:
 
@@ -220,8 +220,8 @@ for name, cost in zip(costs, flight["cost"].sum(1).mean(0).tolist(), strict=True
 # Where to go from here
 # ---------------------
 #
-# - Train it: take :doc:`the first safe policy <first_policy>` and pass ``arm`` to ``ArmEnv``.
+# - Train it: take `the first safe policy <first_policy.html>`_ and pass ``arm`` to ``ArmEnv``.
 # - Load a file of yours. Meshes are found relative to the URDF, also through ``package://``
-#   paths: :doc:`An arm of your own </howto/arm>`.
-# - Nothing is learnt? :doc:`Go through this list </howto/nothing_is_learnt>`.
-# - Reference: :doc:`Arms </reference/arms>`.
+#   paths: `An arm of your own <../howto/arm.html>`_.
+# - Nothing is learnt? `Go through this list <../howto/nothing_is_learnt.html>`_.
+# - Reference: `Arms <../reference/arms.html>`_.

@@ -236,10 +236,10 @@ for name, (mean, low, high) in summarize(evaluate(env, actor, 128, seed=1_000)).
 # ---------------------
 #
 # - Put the loss into your loop: ``LagrangianLoss`` wraps A2C, REINFORCE, PPO and its variants:
-#   :doc:`all algorithms </algorithms>`.
-# - Stop and resume such a run, bit for bit: :doc:`when something breaks </robustness>`.
-# - TorchRL's trainers write the loop for you: :doc:`with TorchRL's trainers </trainers>`.
-# - The multiplier does something strange? :doc:`What it tells you </background/multiplier>`,
-#   :doc:`the multiplier explodes </howto/multiplier_explodes>`.
-# - Reference: :doc:`losses </reference/on_policy>`, :doc:`rules </reference/rules>`,
-#   :doc:`transforms </reference/transforms>`.
+#   `all algorithms <../algorithms.html>`_.
+# - Stop and resume such a run, bit for bit: `when something breaks <../robustness.html>`_.
+# - TorchRL's trainers write the loop for you: `with TorchRL's trainers <../trainers.html>`_.
+# - The multiplier does something strange? `What it tells you <../background/multiplier.html>`_,
+#   `the multiplier explodes <../howto/multiplier_explodes.html>`_.
+# - Reference: `losses <../reference/on_policy.html>`_, `rules <../reference/rules.html>`_,
+#   `transforms <../reference/transforms.html>`_.

@@ -3,7 +3,7 @@ A loss and a multiplier rule of your own, tested
 ================================================
 
 You write a constrained loss and two rules that move its multiplier. Tests of
-:mod:`torchrl_safe.testing` find three faults in them, each of which would have cost you days of
+``torchrl_safe.testing`` find three faults in them, each of which would have cost you days of
 training. At the end you see both rules on a problem whose best policy is known: one circles above
 its limit, the other settles on it.
 
@@ -180,10 +180,10 @@ figure.tight_layout()
 # Where to go from here
 # ---------------------
 #
-# - ``PIDControl`` is such a rule, in relative units and with bounds. Read :doc:`what a multiplier
-#   means </background/multiplier>` before you write another.
+# - ``PIDControl`` is such a rule, in relative units and with bounds. Read `what a multiplier
+#   means <../background/multiplier.html>`_ before you write another.
 # - Try a smaller step in ``Halving``, such as 0.95 instead of a half. How many batches does it
 #   need?
-# - All checks, also those of off-policy losses: :doc:`Test your own loss </testing>`,
-#   :doc:`reference </reference/testing>`.
-# - :doc:`A multiplier rule of your own </howto/rule>`.
+# - All checks, also those of off-policy losses: `Test your own loss <../testing.html>`_,
+#   `reference <../reference/testing.html>`_.
+# - `A multiplier rule of your own <../howto/rule.html>`_.

@@ -15,7 +15,7 @@ It takes about a minute.
 #
 # A task has four members: the objects that it moves (none here), a ``sample`` that draws goals,
 # the ``reward`` and the ``success`` of each world. The last two read an
-# :class:`~torchrl_safe.envs.ArmState`: arrays of all N worlds, in metres and seconds.
+# ``ArmState``: arrays of all N worlds, in metres and seconds.
 #
 # The target runs round the goal once in two seconds. ``state.time`` counts from the start of the
 # episode.
@@ -148,7 +148,7 @@ print(f"mean distance to the target {distance:.3f} m, cost {end['episode_cost'].
 # Training
 # --------
 #
-# PPO-Lagrangian, as in :doc:`the first safe policy <first_policy>`. A limit of 2 allows two
+# PPO-Lagrangian, as in `the first safe policy <first_policy.html>`_. A limit of 2 allows two
 # control steps of the 80 beyond the wall.
 
 FRAMES, FRAMES_PER_BATCH = 51_200, 2_560
@@ -246,7 +246,7 @@ figure.tight_layout()
 # ---------------------
 #
 # - Draw a figure of eight: change ``to_target``. Move the wall: change ``WALL`` to 0.
-# - Test costs and tasks on states made by hand: :doc:`A cost of your own </howto/cost>`.
-# - Tasks that move objects, obstacles of your own: :doc:`Environments </environments>`.
-# - Reference: :doc:`tasks </reference/tasks>`, :doc:`costs </reference/costs>`,
-#   :doc:`observations </reference/observations>`.
+# - Test costs and tasks on states made by hand: `A cost of your own <../howto/cost.html>`_.
+# - Tasks that move objects, obstacles of your own: `Environments <../environments.html>`_.
+# - Reference: `tasks <../reference/tasks.html>`_, `costs <../reference/costs.html>`_,
+#   `observations <../reference/observations.html>`_.

@@ -213,6 +213,6 @@ figure.tight_layout()
 # - Lower the ceiling, or add ``"speed": Speed(limit=1.0)``. Two limits that exclude each other
 #   cannot both be kept: both multipliers then stay at their bound of 10.
 # - Train longer: ``FRAMES = 128_000``.
-# - Logs by name in TensorBoard: :doc:`Keep several limits at once </howto/several_limits>`.
-# - :doc:`The multiplier explodes </howto/multiplier_explodes>`.
-# - Reference: :doc:`costs </reference/costs>`, :doc:`rules </reference/rules>`.
+# - Logs by name in TensorBoard: `Keep several limits at once <../howto/several_limits.html>`_.
+# - `The multiplier explodes <../howto/multiplier_explodes.html>`_.
+# - Reference: `costs <../reference/costs.html>`_, `rules <../reference/rules.html>`_.
