@@ -81,8 +81,8 @@ ray: $(READY)  ## two costs on a Ray cluster; on this machine, or on yours with 
 gallery: $(READY)  ## the pictures of docs/environments.md
 	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)
 
-docs: $(READY)  ## these pages, the tutorial and the API reference as a web site, in docs/_build
-	$(BIN)/sphinx-build -qW docs docs/_build
+docs: $(READY)  ## these pages, the tutorials (run where new) and the API reference, in docs/_build
+	OMP_NUM_THREADS=1 $(BIN)/sphinx-build -qW docs docs/_build $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .
