@@ -63,6 +63,11 @@ class Config:
             raise ValueError(f"eval_episodes must be at least 2, got {self.eval_episodes}.")
 
 
+def folder(out: Path, task: str, seed: int) -> Path:
+    """Where the runs of a task and a seed leave their checkpoints and policies."""
+    return out / "runs" / task / str(seed)
+
+
 def run(config: TrainConfig, algorithm: AlgorithmName, definition: str) -> dict[str, Any]:
     """One run. The definition of its task is kept with it: another one's results are refused."""
     return train.run(config, algorithm)
@@ -80,7 +85,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName, str]]:
                 seed=seed,
                 eval_episodes=config.eval_episodes,
                 workers=1,
-                out=config.out / "runs" / task / str(seed),
+                out=folder(config.out, task, seed),
                 resume=True,
             ),
             algorithm,
