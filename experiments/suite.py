@@ -97,13 +97,13 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName, str]]:
 
 def draw_scenes(config: Config) -> None:
     """Saves a picture of each task: the first world of a seed, some control steps after a reset."""
-    folder = config.out / "pictures"
-    folder.mkdir(parents=True, exist_ok=True)
+    pictures = config.out / "pictures"
+    pictures.mkdir(parents=True, exist_ok=True)
     for name in config.tasks:
         physics = train.PHYSICS[config.physics]
         env = SUITE[name].make_env(physics=physics, seed=1)
         env.rollout(10, lambda td: td.set("action", env.action_spec.zero()))  # noqa: B023
-        plt.imsave(folder / f"{name}.png", env.render(480, 360, CAMERA)[0].numpy())
+        plt.imsave(pictures / f"{name}.png", env.render(480, 360, CAMERA)[0].numpy())
         env.close()
 
 
@@ -115,7 +115,7 @@ def main(config: Config) -> None:
         {"task": settings.suite_task, "algorithm": algorithm, "seed": settings.seed, **result}
         for (settings, algorithm, _), result in zip(grid.values(), results, strict=True)
     ]
-    limits = {name: dict(SUITE[name].cost_limits) for name in config.tasks}
+    limits = {run["task"]: dict(SUITE[run["task"]].cost_limits) for run in runs}
     save_results(config.out, config, runs, report(runs, limits))
     plot_profiles(runs, limits, config.out / "profiles.png")
     plot_training(runs, limits, config.out / "training.png")
