@@ -166,6 +166,11 @@ class Config:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
         if self.demonstrations < 0:
             raise ValueError(f"demonstrations must not be negative, got {self.demonstrations}.")
+        if self.demonstrations and self.action == "joint":
+            raise ValueError(
+                f"demonstrations must be 0 with joint actions, got {self.demonstrations}: pilots "
+                "say where the tool is to go."
+            )
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
         for cost, limit in self.costs.items():

@@ -315,6 +315,15 @@ def test_noise_falls_from_batch_to_batch():
         ({"minibatch": 0}, "minibatch must be at least 1, got 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be positive, got nan"),
         ({"cost_limit": -1.0}, "cost_limit must not be negative, got -1.0"),
+        ({"demonstrations": -1}, "demonstrations must not be negative, got -1"),
+        (
+            {"demonstrations": 1, "algorithms": ("sac-lagrangian",)},
+            "demonstrations must be 0 with sac-lagrangian, which learns off policy, got 1",
+        ),
+        (
+            {"demonstrations": 1, "action": "joint"},
+            "demonstrations must be 0 with joint actions, got 1",
+        ),
         ({"algorithms": ()}, "algorithms must name at least one"),
         ({"algorithms": ("cpo", "td3-lagrangian"), "paper": True}, "not contain td3-lagrangian"),
         ({"algorithms": ("ppo-saute",), "cost_limit": 0.0}, "cost_limit must be positive with ppo"),
@@ -333,7 +342,7 @@ def test_bad_settings(settings, message):
     ("task", "kind", "step", "fingers", "steps"),
     [
         ("reach", Reach, 0.05, 0, 40),
-        ("push", Push, 0.03, 0, 100),
+        ("push", Push, 0.03, 0, 200),
         ("pick-and-place", PickAndPlace, 0.03, 1, 100),
     ],
 )
