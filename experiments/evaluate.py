@@ -26,7 +26,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from experiments import train
 from experiments.agent import num_costs
 from experiments.config import Config as TrainConfig, Engine
-from experiments.report import figures_table, save_animation
+from experiments.film import save_film
+from experiments.report import figures_table
 from torchrl_safe.envs import ArmEnv
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.metrics import conditional_value_at_risk, violation_rate
@@ -66,7 +67,7 @@ class Config:
     gui: bool = False
     """Show some episodes in a window, in real time. Needs a screen, and physics bullet."""
     video: Path | None = None
-    """Film some episodes of an arm into this file, .gif or .webp, at half speed."""
+    """Film some episodes of an arm into this file, .gif or .webp, in slow motion."""
     shown: int = 4
     """Episodes to show or film."""
     out: Path | None = None
@@ -219,8 +220,14 @@ def main(config: Config) -> None:
         (config.out / "results.json").write_text(json.dumps(results, indent=1))
     if config.video is not None:
         stage = make_env(num_envs=1)
-        stage.set_seed(config.seed)
-        save_animation(stage, saved.actor, config.video, config.shown)
+        names = (stage.base_env if isinstance(stage, TransformedEnv) else stage).cost_names
+        save_film(
+            {saved.settings.get("name", config.policy.parent.name): (stage, saved.actor)},
+            config.video,
+            seed=config.seed,
+            limits=dict(zip(names, limits, strict=True)),
+            episodes=config.shown,
+        )
         stage.close()
     if config.gui:
         stage = make_env(num_envs=1, gui=True)

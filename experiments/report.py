@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import torch
 from PIL import Image
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_safe.metrics import mean
 
@@ -104,37 +102,6 @@ def save_picture(env: EnvBase, path: Path) -> None:
     """Saves a picture of the first world at the start of an episode."""
     env.reset()
     Image.fromarray(env.render(width=640, height=480)[0].numpy()).save(path)
-
-
-@torch.no_grad()
-def save_animation(
-    env: EnvBase,
-    policy: Callable[[TensorDictBase], TensorDictBase],
-    path: Path,
-    episodes: int = 2,
-) -> None:
-    """Saves a GIF of the deterministic policy, at half speed."""
-    frames: list[Image.Image] = []
-    # GIF counts in hundredths of a second, and viewers take their time for very few of them.
-    every = max(1, round(env.control_rate / 20))
-    steps = 0
-
-    def shoot() -> None:
-        frames.append(Image.fromarray(env.render(width=320, height=240)[0].numpy()))
-
-    def film(*_: Any) -> None:
-        nonlocal steps
-        if steps % every == 0:
-            shoot()
-        steps += 1
-
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(episodes):
-            env.rollout(env.max_episode_steps, policy, callback=film)
-            shoot()  # Of the last step TorchRL says nothing.
-    path.parent.mkdir(parents=True, exist_ok=True)
-    milliseconds = round(2000 * every / env.control_rate)
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
 
 
 def _is_share(column: str) -> bool:

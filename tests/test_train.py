@@ -4,7 +4,6 @@ import contextlib
 import io
 import json
 import math
-from functools import partial
 from typing import get_args
 
 import pytest
@@ -18,9 +17,10 @@ import experiments.train
 from experiments.agent import make_agent
 from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES, OffPolicy
 from experiments.config import OFF_POLICY, AlgorithmName, Config
+from experiments.film import save_film
 from experiments.learners import NoiseSchedule
 from experiments.log import summed_costs
-from experiments.report import plot_curves, save_animation, table
+from experiments.report import plot_curves, table
 from experiments.train import collecting, main, make_env, train
 from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
@@ -34,6 +34,10 @@ def make_training(algorithm="ppo-lagrangian", **settings):
     training = ALGORITHMS[algorithm].build(env, Config(**settings))
     env.close()
     return training
+
+
+def tiny_film(*args, **settings):
+    save_film(*args, **{**settings, "episodes": 1, "width": 32})
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +56,7 @@ def finished(tmp_path_factory):
     )
     printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
-        patch.setattr(experiments.train, "save_animation", partial(save_animation, episodes=1))
+        patch.setattr(experiments.train, "save_film", tiny_film)
         main(config)
     return config.out, printed.getvalue()
 
@@ -65,9 +69,10 @@ def test_what_it_leaves(finished):
         assert [row["frames"] for row in run["history"]] == [512, 1024]
         for estimate, low, high in run["evaluation"].values():
             assert low <= estimate <= high
-        with Image.open(out / name / "policy.gif") as film:
-            assert film.n_frames > 10
         assert list((out / "logs").rglob(f"*{name}*"))
+    with Image.open(out / "film.gif") as film:
+        assert film.n_frames > 10
+        assert film.width > 2 * 32, "PPO and PPO-Lagrangian, side by side"
     for picture in ("curves.png", "scene.png"):
         with Image.open(out / picture) as image:
             assert image.width >= 640
