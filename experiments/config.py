@@ -227,7 +227,8 @@ class Config:
         """The limit of each cost, by its name and in the order of the costs."""
         if self.suite_task is not None:
             return dict(SUITE[self.suite_task].cost_limits)
-        return {**self.costs} or {"collision": self.cost_limit}
+        chosen = {str(name): limit for name, limit in self.costs.items()}
+        return chosen or {"collision": self.cost_limit}
 
     @property
     def chosen(self) -> tuple[AlgorithmName, ...]:
