@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -32,8 +32,12 @@ from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.metrics import conditional_value_at_risk, violation_rate
 from torchrl_safe.policy import Policy, load_policy
 
-# What of a training run's configuration its environment is made of.
-_ENVIRONMENT = ("arm", "obstacles", "action", "observation", "paper", "cost_limit")
+# What of a training run's configuration its environment is made of; files of before there was a
+# choice lack some of it.
+_ENVIRONMENT = (
+    *("arm", "task", "obstacles", "action", "observation", "paper"),
+    *("cost_limit", "costs", "suite_task", "physics"),
+)
 
 
 @dataclass(frozen=True)
@@ -92,19 +96,15 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
             raise ValueError(
                 f"env must be given for a policy that was trained in {saved.settings['env']}."
             )
-        known = {name: saved.settings[name] for name in _ENVIRONMENT}
-        # Policies of before there was a choice were trained to reach, with Bullet.
-        known["task"] = saved.settings.get("task", "reach")
-        known["physics"] = config.physics or saved.settings.get("physics", "bullet")
-        if config.gui and known["physics"] != "bullet":
+        trained = training_config(saved)
+        if config.physics is not None:
+            trained = replace(trained, physics=config.physics)
+        if config.gui and trained.physics != "bullet":
             raise ValueError(
-                f"gui needs physics=bullet, got {known['physics']!r}, which has no window here: "
+                f"gui needs physics=bullet, got {trained.physics!r}, which has no window here: "
                 "make a video instead."
             )
-        algorithm = saved.settings["name"]
-        return partial(
-            train.make_env, TrainConfig(**known, algorithms=(algorithm,)), algorithm=algorithm
-        )
+        return partial(train.make_env, trained, algorithm=saved.settings["name"])
     module, _, function = config.env.partition(":")
     if not function:
         raise ValueError(f"env must be module:function, got {config.env!r}.")
@@ -112,11 +112,19 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
     return getattr(importlib.import_module(module), function)
 
 
+def training_config(saved: Policy) -> TrainConfig:
+    """What of its training's settings the environment is made of."""
+    known = {name: saved.settings[name] for name in _ENVIRONMENT if name in saved.settings}
+    return TrainConfig(**known, algorithms=(saved.settings["name"],))
+
+
 def cost_limits(config: Config, saved: Policy) -> tuple[float, ...]:
     """The limits that are given, or else those of the training."""
-    if config.cost_limits or "cost_limit" not in saved.settings:
-        return config.cost_limits or tuple(saved.settings.get("cost_limits", ()))
-    return (saved.settings["cost_limit"],)
+    if config.cost_limits:
+        return config.cost_limits
+    if "cost_limit" in saved.settings:  # Of make train.
+        return tuple(training_config(saved).cost_limits.values())
+    return tuple(saved.settings.get("cost_limits", ()))
 
 
 def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
@@ -140,6 +148,11 @@ def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
         raise ValueError(f"video films an ArmEnv, got {str(config.video)!r} with {env}.")
 
 
+def cost_names(env: EnvBase) -> tuple[str, ...]:
+    """Names of the costs; an environment that is no arm has their numbers."""
+    return env.cost_names if is_arm(env) else tuple(map(str, range(num_costs(env))))
+
+
 def is_arm(env: EnvBase) -> bool:
     """Tells whether it is an arm that the environment moves."""
     return isinstance(env.base_env if isinstance(env, TransformedEnv) else env, ArmEnv)
@@ -152,7 +165,7 @@ def play(
     episodes = evaluate(
         env, saved.actor, config.episodes, seed=config.seed, max_steps=config.max_steps
     )
-    names = env.cost_names if is_arm(env) else tuple(map(str, range(num_costs(env))))
+    names = cost_names(env)
     return {**summarize(episodes, names), **safety(episodes, names, limits)}
 
 
@@ -191,10 +204,12 @@ def main(config: Config) -> None:
     env = make_env(num_envs=config.envs)
     try:
         check_fit(env, saved, config)
-        figures = play(env, saved, config, limits)
+        figures, names = play(env, saved, config, limits), cost_names(env)
     finally:
         env.close()
-    text = figures_table({config.policy.parent.name: figures}, limits)
+    text = figures_table(
+        {config.policy.parent.name: figures}, dict(zip(names, limits, strict=True))
+    )
     print(text)
     if config.out is not None:
         config.out.mkdir(parents=True, exist_ok=True)
@@ -203,7 +218,6 @@ def main(config: Config) -> None:
         (config.out / "results.json").write_text(json.dumps(results, indent=1))
     if config.video is not None:
         stage = make_env(num_envs=1)
-        names = (stage.base_env if isinstance(stage, TransformedEnv) else stage).cost_names
         save_film(
             {saved.settings.get("name", config.policy.parent.name): (stage, saved.actor)},
             config.video,

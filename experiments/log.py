@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -102,11 +102,12 @@ def summed_costs(
     }
 
 
-def score(rows: Sequence[dict[str, float]], limit: float) -> float | None:
-    """Mean return of some batches, if each of their mean costs is within the limit."""
+def score(rows: Sequence[dict[str, float]], limits: Mapping[str, float]) -> float | None:
+    """Mean return of some batches, if each of their mean costs is within its limit."""
     ended = [row for row in rows if "return" in row]
-    costs = {name for row in ended for name in row if name.startswith("cost/")}
-    if not ended or any(fmean(row[name] for row in ended) > limit for name in costs):
+    if not ended or any(
+        fmean(row[f"cost/{name}"] for row in ended) > limit for name, limit in limits.items()
+    ):
         return None
     return fmean(row["return"] for row in ended)
 

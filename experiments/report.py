@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -28,10 +28,10 @@ _SMOOTH = 5
 def table(results: dict[str, Any]) -> str:
     """Returns a Markdown table: a row for each algorithm, estimates with 95 % intervals."""
     rows = {name: run["evaluation"] for name, run in results["algorithms"].items()}
-    return figures_table(rows, [results["config"]["cost_limit"]])
+    return figures_table(rows, results["cost_limits"])
 
 
-def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Sequence[float]) -> str:
+def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Mapping[str, float]) -> str:
     """Returns a Markdown table of named rows of figures, each with its interval or without."""
     columns = list(next(iter(rows.values())))
     lines = [
@@ -41,8 +41,12 @@ def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Sequence
     for name, row in rows.items():
         cells = (_cell(*row[column], share=_is_share(column)) for column in columns)
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    limits = ", ".join(f"{limit:g}" for limit in cost_limits)
-    lines.append(f"\nCost limit {limits}; brackets: 95 % confidence.")
+    if len(cost_limits) == 1:
+        (limit,) = cost_limits.values()
+        shown = f"limit {limit:g}"
+    else:
+        shown = "limits " + ", ".join(f"{name} {limit:g}" for name, limit in cost_limits.items())
+    lines.append(f"\nCost {shown}; brackets: 95 % confidence.")
     return "\n".join(lines)
 
 
@@ -104,7 +108,7 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
             axis.xaxis.set_major_formatter(EngFormatter(sep=""))
             if kind == "cost":
                 axis.set_ylim(bottom=0)
-                limit_line(axis, results["config"]["cost_limit"])
+                limit_line(axis, results["cost_limits"][cost])
             elif kind == "summed":
                 # From none to thousands.
                 cost_axis(axis, "y", max(end[1] for end in ends))

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
@@ -26,7 +25,8 @@ from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, Training
-from experiments.config import AlgorithmName, Config
+from experiments.config import AlgorithmName, Config, command_line
+from experiments.demonstrations import start_from_demonstrations
 from experiments.files import is_new, write_whole
 from experiments.film import save_film
 from experiments.grid import side_by_side
@@ -37,36 +37,43 @@ from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import (
     PAPER_CARTESIAN,
     PAPER_JOINT,
+    SUITE,
     ActionMode,
     ArmEnv,
     Bullet,
     CartesianDelta,
     Collision,
+    ContactForce,
     FullObservation,
     Human,
     InFront,
     JointDelta,
+    JointLimit,
     Moving,
     MuJoCo,
     NoObstacles,
     Obstacles,
     Physics,
     PickAndPlace,
+    Proximity,
     Push,
     Reach,
     Scattered,
+    Speed,
+    SpeedAndSeparation,
     Task,
     gym,
     paper_env,
     paper_observation,
 )
+from torchrl_safe.envs.arm_env import Cost
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.policy import load_policy, save_policy
 
 # The tasks, with control steps enough for an episode.
 TASKS: dict[str, tuple[Task, int]] = {
     "reach": (Reach(), 40),
-    "push": (Push(), 100),
+    "push": (Push(), 200),
     "pick-and-place": (PickAndPlace(), 100),
 }
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
@@ -80,7 +87,15 @@ OBSTACLES: dict[str, Obstacles] = {
 PHYSICS: dict[str, Physics] = {"bullet": Bullet(), "mujoco": MuJoCo()}
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
-COSTS = {"collision": Collision()}
+COSTS: dict[str, Cost] = {
+    "collision": Collision(),
+    "contact-force": ContactForce(),
+    "joint-limit": JointLimit(),
+    "proximity": Proximity(),
+    "separation": SpeedAndSeparation(),
+    # Actions ask for up to 1 m/s along each axis.
+    "speed": Speed(limit=1.0),
+}
 # What may be another when a run is resumed: it changes nothing in what is learnt.
 CHANGEABLE = ("algorithms", "shield", "jobs", "out", "logger", "resume", "checkpoint_every")
 
@@ -99,7 +114,6 @@ def make_env(
     The sums, over each episode, are of what the arm has earned and cost, whatever an algorithm
     makes of it.
     """
-    task, steps = TASKS[config.task]
     settings: dict[str, Any] = {
         "observation": OBSERVATIONS[config.observation],
         "num_envs": num_envs,
@@ -112,14 +126,9 @@ def make_env(
         env = paper_env(PAPER_ACTIONS[config.action], **settings)
     else:
         env = ArmEnv(
-            ARMS[config.arm],
-            action=make_action(config),
-            task=task,
-            obstacles=OBSTACLES[config.obstacles],
-            costs=COSTS,
             physics=PHYSICS[config.physics],
             shield=ALGORITHMS[algorithm].shield,
-            **{"max_episode_steps": steps, **settings},
+            **{**arm_arguments(config), **settings},
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = ALGORITHMS[algorithm].transforms(config)
@@ -128,13 +137,31 @@ def make_env(
     return TransformedEnv(env, Compose(sums, *transforms))
 
 
+def arm_arguments(config: Config) -> dict[str, Any]:
+    """What the arm, its task and its costs are, as arguments of ArmEnv."""
+    if config.suite_task is not None:
+        return SUITE[config.suite_task].arguments
+    task, steps = TASKS[config.task]
+    return {
+        "arm": ARMS[config.arm],
+        "action": make_action(config),
+        "task": task,
+        "obstacles": OBSTACLES[config.obstacles],
+        "costs": {name: COSTS[name] for name in config.cost_limits},
+        "max_episode_steps": steps,
+    }
+
+
 def make_action(config: Config) -> ActionMode:
     """Makes what an action does, as the task needs it."""
+    if config.task == "reach":
+        return JointDelta() if config.action == "joint" else CartesianDelta()
     fingers = 0.04 if config.task == "pick-and-place" else None
     if config.action == "joint":
         return JointDelta(finger_step=fingers)
     # As fast as an arm may reach, 1 m/s, a cube that is hit slides on for 0.2 m.
-    return CartesianDelta(step=0.05 if config.task == "reach" else 0.03, finger_step=fingers)
+    held = ARMS[config.arm].handling_orientation
+    return CartesianDelta(step=0.03, orientation=held, finger_step=fingers)
 
 
 @contextmanager
@@ -189,6 +216,7 @@ def train(
     env.close()
     log = Log(config.logger, config.out / "logs", algorithm)
     batches = math.ceil(config.frames / config.frames_per_batch)
+    costs = tuple(config.cost_limits)
     with (
         collecting(config, training.collector, algorithm) as collector,
         tqdm(
@@ -211,10 +239,11 @@ def train(
             },
             settings={"algorithm": algorithm, **settings(dataclasses.asdict(config))},
         )
-        if config.resume:
-            checkpoints.load()
-        else:
+        if not config.resume:
             checkpoints.clear()
+        if checkpoints.load() is None and config.demonstrations:
+            demonstrate(config, algorithm, training)
+            collector.update_policy_weights_()
         log.open()
         bar.update(log.frames)
         for batch in islice(collector, batches - len(log.rows)):
@@ -224,15 +253,23 @@ def train(
             training.learner.learn(batch)
             collector.update_policy_weights_()
             bar.update(batch.numel())
-            row = figures(episodes, training.loss, tuple(COSTS))
-            row |= summed_costs(batch, log.rows, tuple(COSTS))
+            row = figures(episodes, training.loss, costs)
+            row |= summed_costs(batch, log.rows, costs)
             bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
             log.add({"frames": log.frames + batch.numel(), **row})
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
                 recent = log.rows[-config.checkpoint_every :]
-                checkpoints.save(log.frames, score=score(recent, config.cost_limit))
+                checkpoints.save(log.frames, score=score(recent, config.cost_limits))
     keep_policy(config, algorithm, training)
     return training.actor, log
+
+
+def demonstrate(config: Config, algorithm: AlgorithmName, training: Training) -> None:
+    """Starts policy and critics from demonstrations, in episodes that nothing else uses."""
+    seed = config.seed + 2_000_000
+    env = make_env(config, config.envs, seed, algorithm, training=True)
+    start_from_demonstrations(training, env, config)
+    env.close()
 
 
 def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) -> None:
@@ -260,7 +297,7 @@ def train_and_evaluate(
         "versions": versions(),
         "seconds": seconds,
         "history": log.rows,
-        "evaluation": summarize(episodes, tuple(COSTS)),
+        "evaluation": summarize(episodes, tuple(config.cost_limits)),
         "episodes": {name: value.tolist() for name, value in episodes.items()},
     }
 
@@ -273,7 +310,11 @@ def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
 def start(config: Config) -> dict[str, Any]:
     """Begins a run, or reads what one that is resumed has finished."""
     path = config.out / "results.json"
-    results: dict[str, Any] = {"config": dataclasses.asdict(config), "algorithms": {}}
+    results: dict[str, Any] = {
+        "config": dataclasses.asdict(config),
+        "cost_limits": config.cost_limits,
+        "algorithms": {},
+    }
     if config.resume and path.exists():
         before = json.loads(path.read_text())
         refuse_other_settings(settings(before["config"]), settings(results["config"]))
@@ -303,9 +344,7 @@ def film(config: Config, path: Path, *, seed: int, **options: Any) -> None:
         for name in config.chosen
     }
     try:
-        save_film(
-            actors, path, seed=seed, limits=dict.fromkeys(COSTS, config.cost_limit), **options
-        )
+        save_film(actors, path, seed=seed, limits=config.cost_limits, **options)
     finally:
         for env, _ in actors.values():
             env.close()
@@ -345,4 +384,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(command_line())

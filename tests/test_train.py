@@ -148,11 +148,11 @@ def test_curves_with_a_shield_show_the_sum(tmp_path):
     widths = []
     for name in ("ppo", "ppo-shield"):
         row = {"frames": 8, "return": -1.0, "cost/collision": 1.0, "summed/collision": 3.0}
-        results = {"config": {"cost_limit": 0.5}, "algorithms": {name: {"history": [row]}}}
+        results = {"cost_limits": {"collision": 0.5}, "algorithms": {name: {"history": [row]}}}
         plot_curves(results, tmp_path / "curves.png")
         with Image.open(tmp_path / "curves.png") as image:
             widths.append(image.width)
-    assert widths == [1200, 1800]
+    assert widths[1] == pytest.approx(1.5 * widths[0], abs=1)
 
 
 def test_multiplier_rules():
@@ -324,6 +324,9 @@ def test_noise_falls_from_batch_to_batch():
         ({"algorithms": ("cpo", "td3-lagrangian"), "paper": True}, "not contain td3-lagrangian"),
         ({"algorithms": ("ppo-saute",), "cost_limit": 0.0}, "cost_limit must be positive with ppo"),
         ({"shield": True, "paper": True}, "shield must be False with paper"),
+        ({"costs": {"speed": -1.0}}, "costs must have limits of at least 0, got -1.0 for speed"),
+        ({"costs": {"speed": 1.0}, "cost_limit": 2.0}, "cost_limit must be 0.5 with costs, got 2"),
+        ({"costs": {"speed": 1.0}, "paper": True}, "costs must be {} with paper, got {'speed': 1"),
     ],
 )
 def test_bad_settings(settings, message):

@@ -57,6 +57,7 @@ from torchrl_safe.envs.physics.simulator import Nearest, Physics, Simulator
 from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.shield import Shield
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
+from torchrl_safe.envs.suite import SUITE, SuiteTask
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
 from torchrl_safe.envs.transforms import CostToReward, EarlyTermination, FrameSkip, Saute
 
@@ -67,6 +68,7 @@ __all__ = [
     "PAPER_JOINT",
     "PAPER_SETTINGS",
     "PARALLEL_GRIPPER",
+    "SUITE",
     "UR5",
     "UR10",
     "XARM6",
@@ -124,6 +126,7 @@ __all__ = [
     "Speed",
     "SpeedAndSeparation",
     "Sphere",
+    "SuiteTask",
     "Swing",
     "Task",
     "Workspace",
