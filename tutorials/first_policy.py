@@ -12,8 +12,6 @@ on its collisions, and film both. This is the picture at the end:
 Both together take about a minute and a half on one core.
 """
 
-# sphinx_gallery_thumbnail_number = -1
-
 # %%
 # The environment
 # ---------------
@@ -24,6 +22,8 @@ Both together take about a minute and a half on one core.
 # obstacle in front of it. ``num_envs`` worlds run side by side.
 #
 # ``cost`` is a second reward. TorchRL's ``RewardSum`` adds up both over an episode.
+
+# sphinx_gallery_thumbnail_number = -1
 
 import matplotlib.pyplot as plt
 import torch

@@ -9,14 +9,14 @@ paths: over the obstacle with one limit, and around it with two.
 Both together take about a minute and a half on one core.
 """
 
-# sphinx_gallery_thumbnail_number = -1
-
 # %%
 # Costs by name
 # -------------
 #
 # ``costs`` is a dict. ``cost`` then has a column for each entry, in this order. ``Workspace``
 # costs 1 for a control step in which the tool leaves a box. The ceiling is the top of the box.
+
+# sphinx_gallery_thumbnail_number = -1
 
 import matplotlib.pyplot as plt
 import torch
