@@ -34,13 +34,13 @@ torch.manual_seed(0)
 torch.set_num_threads(1)
 torchrl_logger.setLevel("WARNING")
 
-arm = ArmEnv(
-    action=JointDelta(),
-    costs={"collision": Collision()},
-    physics=MuJoCo(),
-    num_envs=32,
-    seed=0,
-)
+
+def make_arm():
+    costs = {"collision": Collision()}
+    return ArmEnv(action=JointDelta(), costs=costs, physics=MuJoCo(), num_envs=32, seed=0)
+
+
+arm = make_arm()
 print(arm.reward_spec)
 
 # %%
@@ -226,10 +226,12 @@ axes[1].text(1.01, 0.5, "limit", va="center", transform=axes[1].get_yaxis_transf
 figure.tight_layout()
 
 # %%
-# And without the noise of exploration, in worlds that training has not seen:
+# And without the noise of exploration, in worlds that training has not seen. (The collector has
+# closed its environment after the last frame, so this is another one.)
 
-for name, (mean, low, high) in summarize(evaluate(env, actor, 128, seed=1_000)).items():
-    print(f"{name:12} {mean:6.2f}   [{low:.2f}, {high:.2f}]")
+episodes = evaluate(make_arm(), actor, 128, seed=1_000)
+for name, (mean, low, high) in summarize(episodes, arm.cost_names).items():
+    print(f"{name:16} {mean:6.2f}   [{low:.2f}, {high:.2f}]")
 
 # %%
 # Where to go from here
