@@ -69,7 +69,7 @@ print(int(ended.sum()), "episodes ended, mean cost", round(episode_cost.mean().i
 # --------------------
 #
 # The actor is that of any PPO. Beside the critic of the reward there is one of the costs, with an
-# output for each. Two things make small networks learn fast. They standardize observations, by
+# output for each. Two details make them learn faster. They standardize observations, by
 # the random ones from above: goals differ by centimetres, velocities by metres a second. And the
 # critics predict the mean of a step, of which a value is about ``1 / (1 - GAMMA)`` times as much.
 
