@@ -78,11 +78,11 @@ attack: $(READY)  ## tries to make a shielded arm touch something: ARGS="--steps
 ray: $(READY)  ## two costs on a Ray cluster; on this machine, or on yours with ARGS="--address auto"
 	$(BIN)/python -m experiments.ray_training $(ARGS)
 
-gallery: $(READY)  ## the contact sheet of docs/environments.md
+gallery: $(READY)  ## the pictures of docs/environments.md
 	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)
 
-docs: $(READY)  ## these pages, the tutorial and the API reference as a web site, in docs/_build
-	$(BIN)/sphinx-build -qW docs docs/_build
+docs: $(READY)  ## these pages, the tutorials (run where new) and the API reference, in docs/_build
+	OMP_NUM_THREADS=1 $(BIN)/sphinx-build -qW docs docs/_build $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import tyro
 
+from experiments.options import short_help
 from torchrl_safe.envs import SUITE, PickAndPlace, Push, Reach
 
 Action = Literal["cartesian", "joint"]
@@ -190,6 +191,11 @@ class Config:
                 raise ValueError(
                     f"algorithms must not contain {name} with paper: it needs bounded actions."
                 )
+            if name in ("cpo", "pcpo") and len(self.cost_limits) > 1:
+                raise ValueError(
+                    f"algorithms must not contain {name} with several costs, got "
+                    f"{', '.join(self.cost_limits)}: it limits one."
+                )
             if self.demonstrations and name in OFF_POLICY:
                 raise ValueError(
                     f"demonstrations must be 0 with {name}, which learns off policy, got "
@@ -222,7 +228,8 @@ class Config:
         """The limit of each cost, by its name and in the order of the costs."""
         if self.suite_task is not None:
             return dict(SUITE[self.suite_task].cost_limits)
-        return {**self.costs} or {"collision": self.cost_limit}
+        chosen = {str(name): limit for name, limit in self.costs.items()}
+        return chosen or {"collision": self.cost_limit}
 
     @property
     def chosen(self) -> tuple[AlgorithmName, ...]:
@@ -262,6 +269,26 @@ TASKS: dict[str, type] = {"reach": Reach, "push": Push, "pick-and-place": PickAn
 KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: _HANDLING, PickAndPlace: _HANDLING}
 
 
+#: How ``--help`` groups the options.
+GROUPS = {
+    "What to train in": (
+        *("task", "arm", "obstacles", "action", "observation", "physics", "suite_task", "paper"),
+    ),
+    "What to train": ("algorithms", "shield", "cost_limit", "costs", "frames", "seed"),
+    "The run": ("out", "resume", "logger", "checkpoint_every", "eval_episodes"),
+    "Speed": ("envs", "workers", "jobs"),
+    "Learning": (
+        *("frames_per_batch", "epochs", "minibatch", "learning_rate", "gamma", "hidden"),
+        *("first_log_std", "last_log_std", "episode_steps", "demonstrations"),
+    ),
+    "The multiplier": ("multiplier_rule", "multiplier_init", "multiplier_rate", "pessimism"),
+}
+_MORE = (
+    "Values shown are the defaults. --help-all says more about each option, with all choices.\n"
+    'Example: make train ARGS="--physics mujoco --obstacles human --cost-limit 1"'
+)
+
+
 def suite_config(name: SuiteTaskName, **others: Any) -> Config:
     """Returns what a task of the suite is trained with.
 
@@ -284,9 +311,14 @@ def command_line(arguments: Sequence[str] | None = None) -> Config:
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--suite-task", "--suite_task", choices=[*SUITE])
     first.add_argument("--task", default="reach")
+    first.add_argument("-h", "--help", action="store_true")
+    first.add_argument("--help-all", "--help_all", action="store_true")
     known, _ = first.parse_known_args(arguments)
     if known.suite_task is not None:
         default = suite_config(known.suite_task)
     else:
         default = Config(**KINDS[TASKS.get(known.task, Reach)])
-    return tyro.cli(Config, args=arguments, default=default)
+    if known.help:
+        print(f"{Config.__doc__}\n\n{short_help(default, GROUPS)}\n\n{_MORE}")
+        raise SystemExit
+    return tyro.cli(Config, args=["--help"] if known.help_all else arguments, default=default)

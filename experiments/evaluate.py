@@ -1,7 +1,8 @@
 """Plays with a policy that was saved: how good it is, how safe, and what it looks like.
 
 ``python -m experiments.evaluate --policy runs/x/ppo-lagrangian/policy.pt`` plays in the environment
-of its training; ``--env my_module:make_env`` in one of your own.
+of its training, ``--policy panda-reach-in-front`` with a policy that comes with the package, and
+``--env my_module:make_env`` in an environment of your own.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from experiments import train
 from experiments.agent import num_costs
 from experiments.config import Config as TrainConfig, Engine
-from experiments.report import figures_table, save_animation
+from experiments.film import save_film
+from experiments.report import figures_table
 from torchrl_safe.envs import ArmEnv
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.metrics import conditional_value_at_risk, violation_rate
@@ -44,7 +46,8 @@ class Config:
     """Evaluate a policy that was saved on its own."""
 
     policy: Path
-    """File that training has written: runs/.../policy.pt."""
+    """File that training has written, runs/.../policy.pt, or the name of a policy that comes with
+    the package, such as panda-reach-in-front."""
     env: str | None = None
     """An environment of your own, as module:function. Called as function(num_envs=...), it
     returns an ArmEnv, or any environment with reward and cost. Without it, the environment that
@@ -64,7 +67,7 @@ class Config:
     gui: bool = False
     """Show some episodes in a window, in real time. Needs a screen, and physics bullet."""
     video: Path | None = None
-    """Film some episodes of an arm into this file, .gif or .webp, at half speed."""
+    """Film some episodes of an arm into this file, .gif or .webp, in slow motion."""
     shown: int = 4
     """Episodes to show or film."""
     out: Path | None = None
@@ -217,8 +220,13 @@ def main(config: Config) -> None:
         (config.out / "results.json").write_text(json.dumps(results, indent=1))
     if config.video is not None:
         stage = make_env(num_envs=1)
-        stage.set_seed(config.seed)
-        save_animation(stage, saved.actor, config.video, config.shown)
+        save_film(
+            {saved.settings.get("name", config.policy.parent.name): (stage, saved.actor)},
+            config.video,
+            seed=config.seed,
+            limits=dict(zip(names, limits, strict=True)),
+            episodes=config.shown,
+        )
         stage.close()
     if config.gui:
         stage = make_env(num_envs=1, gui=True)

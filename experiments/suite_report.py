@@ -110,7 +110,7 @@ def scores(
                 for of_task in [limits[task].items()]
             ]
         )
-    return torch.tensor(success), torch.tensor(excess)
+    return torch.tensor(success, dtype=torch.float64), torch.tensor(excess, dtype=torch.float64)
 
 
 def profile(

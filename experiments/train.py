@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,9 +28,10 @@ from experiments.algorithms import ALGORITHMS, Training
 from experiments.config import AlgorithmName, Config, command_line
 from experiments.demonstrations import start_from_demonstrations
 from experiments.files import is_new, write_whole
+from experiments.film import save_film
 from experiments.grid import side_by_side
-from experiments.log import Log, figures, score, summed_costs, versions
-from experiments.report import plot_curves, save_animation, save_picture, table
+from experiments.log import Log, figures, progress_text, score, summed_costs, versions
+from experiments.report import plot_curves, save_picture, table
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
 from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import (
@@ -66,7 +68,7 @@ from torchrl_safe.envs import (
 )
 from torchrl_safe.envs.arm_env import Cost
 from torchrl_safe.evaluation import evaluate, summarize
-from torchrl_safe.policy import save_policy
+from torchrl_safe.policy import load_policy, save_policy
 
 # The tasks, with control steps enough for an episode.
 TASKS: dict[str, tuple[Task, int]] = {
@@ -220,8 +222,8 @@ def train(
         tqdm(
             total=config.frames,
             desc=algorithm,
-            unit="frame",
-            unit_scale=True,
+            # Rates and counts would push off the line what one wants to know.
+            bar_format="{desc} {percentage:3.0f} % |{bar:20}| {remaining} left{postfix}",
             disable=not progress,
             position=line,
         ) as bar,
@@ -253,7 +255,7 @@ def train(
             bar.update(batch.numel())
             row = figures(episodes, training.loss, costs)
             row |= summed_costs(batch, log.rows, costs)
-            bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
+            bar.set_postfix_str(progress_text(row, config.cost_limits))
             log.add({"frames": log.frames + batch.numel(), **row})
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
                 recent = log.rows[-config.checkpoint_every :]
@@ -327,13 +329,25 @@ def start(config: Config) -> dict[str, Any]:
     return results
 
 
-def train_and_film(config: Config, algorithm: AlgorithmName, line: int = 0) -> dict[str, Any]:
-    """Trains, evaluates and films one algorithm; returns its results."""
-    actor, result = train_and_evaluate(config, algorithm, line=line)
-    stage = make_env(config, num_envs=1, seed=config.seed, algorithm=algorithm)
-    save_animation(stage, actor, config.out / algorithm / "policy.gif")
-    stage.close()
-    return result
+def result_of(config: Config, algorithm: AlgorithmName, line: int = 0) -> dict[str, Any]:
+    """Trains and evaluates one algorithm; returns its results, which fit into a pipe."""
+    return train_and_evaluate(config, algorithm, line=line)[1]
+
+
+def film(config: Config, path: Path, *, seed: int, **options: Any) -> None:
+    """Films the policies of a run side by side; ``options`` are those of :func:`save_film`."""
+    actors = {
+        name: (
+            make_env(config, num_envs=1, algorithm=name),
+            load_policy(config.out / name / "policy.pt").actor,
+        )
+        for name in config.chosen
+    }
+    try:
+        save_film(actors, path, seed=seed, limits=config.cost_limits, **options)
+    finally:
+        for env, _ in actors.values():
+            env.close()
 
 
 def finish(
@@ -343,10 +357,10 @@ def finish(
     workers = min(config.side_by_side, len(algorithms))
     if workers < 2:
         for algorithm in algorithms:
-            yield algorithm, train_and_film(config, algorithm)
+            yield algorithm, result_of(config, algorithm)
         return
     jobs = [(config, algorithm, line) for line, algorithm in enumerate(algorithms)]
-    for index, result in side_by_side(train_and_film, jobs, workers=workers):
+    for index, result in side_by_side(result_of, jobs, workers=workers):
         yield algorithms[index], result
 
 
@@ -363,6 +377,7 @@ def main(config: Config) -> None:
     save_picture(stage, config.out / "scene.png")
     stage.close()
     plot_curves(results, config.out / "curves.png")
+    film(config, config.out / "film.gif", seed=config.seed, width=320)
     text = table(results)
     (config.out / "table.md").write_text(text)
     print(f"\n{text}\nResults are in {config.out}.")

@@ -51,10 +51,10 @@ class SuiteTask:
     Examples:
         >>> task = SUITE["panda-reach-human"]
         >>> dict(task.cost_limits)
-        {'collision': 0.5, 'separation': 1.0}
+        {'collision': 0.5, 'separation': 0.5}
         >>> env = task.make_env(num_envs=2, seed=0)
         >>> env.cost_names, env.max_episode_steps
-        (('collision', 'separation'), 40)
+        (('collision', 'separation'), 60)
         >>> env.close()
     """
 
@@ -65,7 +65,7 @@ class SuiteTask:
     costs: Mapping[str, Cost]
     cost_limits: Mapping[str, float]
     action: ActionMode = CartesianDelta()
-    max_episode_steps: int = 40
+    max_episode_steps: int = 60
     frames: int = 128_000
 
     def __post_init__(self) -> None:
@@ -115,11 +115,13 @@ class SuiteTask:
         return ArmEnv(**self.arguments, **settings)
 
 
-_ONE_TOUCH = {"collision": Collision()}
-_BESIDE_A_PERSON = {"collision": Collision(), "separation": SpeedAndSeparation()}
+_ONE_TOUCH: dict[str, Cost] = {"collision": Collision()}
+_BESIDE_A_PERSON: dict[str, Cost] = {
+    "collision": Collision(),
+    "separation": SpeedAndSeparation(),
+}
 # Who hardly waits is there before the arm has passed.
 _BUSY_PERSON = Human(pause=(0.05, 0.3))
-_SLOW = CartesianDelta(step=0.03)
 
 
 def _handling(arm: ArmModel, finger_step: float | None = None) -> CartesianDelta:
@@ -151,17 +153,19 @@ SUITE: dict[str, SuiteTask] = {
             Reach(),
             _BUSY_PERSON,
             _BESIDE_A_PERSON,
-            {"collision": 0.5, "separation": 1.0},
-            _SLOW,
+            {"collision": 0.5, "separation": 0.5},
+            # 0.5 m/s along each axis: fast enough to get out of the person's way.
+            CartesianDelta(step=0.025),
         ),
         SuiteTask(
             "iiwa-reach-joints",
             IIWA,
             Reach(),
             InFront(),
-            {"collision": Collision(), "joint-limit": JointLimit(), "speed": Speed(limit=1.0)},
-            {"collision": 0.5, "joint-limit": 0.5, "speed": 2.0},
-            JointDelta(),
+            {"collision": Collision(), "joint-limit": JointLimit(), "speed": Speed(limit=0.75)},
+            {"collision": 0.5, "joint-limit": 0.5, "speed": 1.0},
+            # At 2 rad/s, JointDelta's own, the noise of a policy that explores is itself too fast.
+            JointDelta(step=0.05),
         ),
         SuiteTask(
             "xarm6-push-in-front",
