@@ -254,7 +254,7 @@ class Config:
 
 _HANDLING = {
     "demonstrations": 98_304,
-    "frames": 196_608,
+    "frames": 131_072,
     "envs": 64,
     "frames_per_batch": 4096,
     "minibatch": 512,

@@ -29,6 +29,11 @@ from torchrl_safe.envs.state import Array
 _LOW = 0.033
 # How far above the obstacles, and without any above the table, the tool goes over to the object.
 _OVER, _ABOVE_TABLE = 0.13, 0.12
+# How far it goes in a control step beside what moves, m; and how far off that is to be, m: it goes
+# back from there, and more slowly before. What comes nearer is to be as far as it comes in a time, s.
+_PACE, _ROOM, _SLOWER, _TIME = 0.027, 0.11, 0.1, 0.5
+# What of the hand is to be out of the way: heights above the tool point, and half its width, m.
+_HAND, _HALF_WIDTH = (0.0, 0.1, 0.2), 0.07
 # Share of the largest action: a policy that squashes its output can give it.
 _SHARE = 0.9
 
@@ -159,8 +164,7 @@ PILOTS: dict[type[Task], Pilot] = {
 def make_pilot(env: ArmEnv) -> Pilot:
     """Makes the pilot of an environment's task.
 
-    It looks at what stands in the way, not at what moves: where that will be it cannot know, and
-    costs are to teach it to a policy.
+    What stands, it goes round or over; from what moves, it steps back.
 
     Raises:
         ValueError: if the task has none, or its actions do not move the tool.
@@ -169,18 +173,46 @@ def make_pilot(env: ArmEnv) -> Pilot:
         raise ValueError(f"demonstrations need Cartesian actions, got {env.action_mode}.")
     for task, pilot in PILOTS.items():
         if isinstance(env.task, task):
-            return _blind(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
+            return _stepping_back(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
     raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
 
 
-def _blind(pilot: Pilot) -> Pilot:
-    """The pilot where no obstacles are."""
+def _stepping_back(pilot: Pilot) -> Pilot:
+    """The pilot where nothing stands, which gets out of the way of what moves."""
 
     def fly(state: ArmState) -> tuple[Array, Array]:
         nothing = np.zeros_like(state.obstacle_present)
-        return pilot(replace(state, obstacle_present=nothing))
+        target, opening = pilot(replace(state, obstacle_present=nothing))
+        room, away = _room(state)
+        step = target - state.ee_position
+        step *= np.minimum(1, _PACE / np.maximum(_length(step), 1e-9))[:, None]
+        ahead, back = np.clip(room / _SLOWER, 0, 1), np.clip(-room / _SLOWER, 0, 1)
+        step = ahead[:, None] * step + back[:, None] * _PACE * away
+        return state.ee_position + step, opening
 
     return fly
+
+
+def _room(state: ArmState) -> tuple[Array, Array]:
+    """How much further off than it is to be all is that moves, m, and the way away from it."""
+    points = state.ee_position[:, None] + np.array([[0, 0, height] for height in _HAND])
+    points = points[:, :, None]
+    half = state.obstacle_size[:, 2] - state.obstacle_size[:, 0]
+    x, y, z, w = np.moveaxis(state.obstacle_orientation, -1, 0)
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+    off = points - state.obstacle_position[:, None]
+    along = np.clip((off * axis[:, None]).sum(-1), -half, half)[..., None] * axis[:, None]
+    velocity = state.obstacle_velocity[:, None] + np.cross(
+        state.obstacle_angular_velocity[:, None], along
+    )
+    way = off - along
+    gap = _length(way) - state.obstacle_size[:, 0] - _HALF_WIDTH
+    coming = np.maximum(0, (velocity * _unit(way)).sum(-1))
+    room = np.where(state.obstacle_present[:, None], gap - _TIME * coming - _ROOM, np.inf)
+    room = room.reshape(len(room), -1)
+    nearest = room.argmin(1)
+    away = way.reshape(len(room), -1, 3)[np.arange(len(room)), nearest] * (1, 1, 0)
+    return room.min(1), _unit(_unit(away) + np.array([-1.0, 0, 0]))
 
 
 def _from_above(tool: Array, place: Array, top: Array, slack: float = 0.0) -> Array:

@@ -122,6 +122,8 @@ _BESIDE_A_PERSON: dict[str, Cost] = {
 }
 # Who hardly waits is there before the arm has passed.
 _BUSY_PERSON = Human(pause=(0.05, 0.3))
+# Far enough away that there is room to step back from the hand, and time to push.
+_PERSON_OPPOSITE = Human(shoulder=(1.25, 0.3, 0.4), rest=(1.0, 0.35, 0.2))
 
 
 def _handling(arm: ArmModel, finger_step: float | None = None) -> CartesianDelta:
@@ -181,7 +183,7 @@ SUITE: dict[str, SuiteTask] = {
             "panda-push-human",
             PANDA,
             Push(),
-            Human(),
+            _PERSON_OPPOSITE,
             _BESIDE_A_PERSON,
             {"collision": 0.5, "separation": 2.0},
             _handling(PANDA),
