@@ -51,7 +51,7 @@ class SuiteTask:
     Examples:
         >>> task = SUITE["panda-reach-human"]
         >>> dict(task.cost_limits)
-        {'collision': 0.5, 'separation': 0.5}
+        {'collision': 0.5, 'separation': 1.0}
         >>> env = task.make_env(num_envs=2, seed=0)
         >>> env.cost_names, env.max_episode_steps
         (('collision', 'separation'), 60)
@@ -153,7 +153,7 @@ SUITE: dict[str, SuiteTask] = {
             Reach(),
             _BUSY_PERSON,
             _BESIDE_A_PERSON,
-            {"collision": 0.5, "separation": 0.5},
+            {"collision": 0.5, "separation": 1.0},
             # 0.5 m/s along each axis: fast enough to get out of the person's way.
             CartesianDelta(step=0.025),
         ),
