@@ -14,7 +14,6 @@ from experiments.grid import missing
 from experiments.log import score
 from experiments.report import figures_table
 from experiments.suite_report import (
-    colours,
     plot_profiles,
     plot_training,
     profile,
@@ -242,12 +241,6 @@ def test_figures_are_drawn(tmp_path):
         plot(RUNS, LIMITS, tmp_path / "figure.png")
         with Image.open(tmp_path / "figure.png") as image:
             assert image.width > 500
-
-
-def test_an_algorithm_has_one_colour_everywhere():
-    few, many = colours(["ppo-lagrangian"]), colours(["cpo", "ppo", "focops"])
-    assert few["ppo-lagrangian"] == many["ppo-lagrangian"]
-    assert len(set(many.values())) == len(many) == 4
 
 
 def test_jobs_are_what_make_train_runs(tmp_path):
