@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import tyro
 
+from experiments.options import short_help
 from torchrl_safe.envs import SUITE, PickAndPlace, Push, Reach
 
 Action = Literal["cartesian", "joint"]
@@ -252,8 +253,8 @@ class Config:
 
 
 _HANDLING = {
-    "demonstrations": 65_536,
-    "frames": 262_144,
+    "demonstrations": 98_304,
+    "frames": 196_608,
     "envs": 64,
     "frames_per_batch": 4096,
     "minibatch": 512,
@@ -270,6 +271,26 @@ KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: _HANDLING, PickAndPlace: _
 # The wide noise of make train is itself faster than a limit of the suite allows, and nearer to
 # joint limits: multipliers then rise before anything is learnt.
 _SUITE_KINDS = {**KINDS, Reach: {**KINDS[Reach], "first_log_std": -1.0}}
+
+
+#: How ``--help`` groups the options.
+GROUPS = {
+    "What to train in": (
+        *("task", "arm", "obstacles", "action", "observation", "physics", "suite_task", "paper"),
+    ),
+    "What to train": ("algorithms", "shield", "cost_limit", "costs", "frames", "seed"),
+    "The run": ("out", "resume", "logger", "checkpoint_every", "eval_episodes"),
+    "Speed": ("envs", "workers", "jobs"),
+    "Learning": (
+        *("frames_per_batch", "epochs", "minibatch", "learning_rate", "gamma", "hidden"),
+        *("first_log_std", "last_log_std", "episode_steps", "demonstrations"),
+    ),
+    "The multiplier": ("multiplier_rule", "multiplier_init", "multiplier_rate", "pessimism"),
+}
+_MORE = (
+    "Values shown are the defaults. --help-all says more about each option, with all choices.\n"
+    'Example: make train ARGS="--physics mujoco --obstacles human --cost-limit 1"'
+)
 
 
 def suite_config(name: SuiteTaskName, **others: Any) -> Config:
@@ -294,9 +315,14 @@ def command_line(arguments: Sequence[str] | None = None) -> Config:
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--suite-task", "--suite_task", choices=[*SUITE])
     first.add_argument("--task", default="reach")
+    first.add_argument("-h", "--help", action="store_true")
+    first.add_argument("--help-all", "--help_all", action="store_true")
     known, _ = first.parse_known_args(arguments)
     if known.suite_task is not None:
         default = suite_config(known.suite_task)
     else:
         default = Config(**KINDS[TASKS.get(known.task, Reach)])
-    return tyro.cli(Config, args=arguments, default=default)
+    if known.help:
+        print(f"{Config.__doc__}\n\n{short_help(default, GROUPS)}\n\n{_MORE}")
+        raise SystemExit
+    return tyro.cli(Config, args=["--help"] if known.help_all else arguments, default=default)

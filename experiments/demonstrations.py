@@ -32,7 +32,7 @@ _FIRST, _NOISE = 0.25, 0.2
 # drawn so many times from all; in the end, all of them.
 _STEPS, _TIMES, _LAST_TIMES = 32, 50, 40
 # Control steps in a minibatch, and Adam's learning rate, which falls to 0 in the end.
-_SIZE, _RATE = 1024, 2e-3
+_SIZE, _RATE = 512, 5e-3
 # How often the critics look again at what the learnt policy has earned and cost, and how long.
 _LOOKS, _PASSES = 6, 4
 

@@ -220,7 +220,6 @@ def main(config: Config) -> None:
         (config.out / "results.json").write_text(json.dumps(results, indent=1))
     if config.video is not None:
         stage = make_env(num_envs=1)
-        names = (stage.base_env if isinstance(stage, TransformedEnv) else stage).cost_names
         save_film(
             {saved.settings.get("name", config.policy.parent.name): (stage, saved.actor)},
             config.video,

@@ -91,7 +91,7 @@ def draw(
     axis.set_title(arm + task + obstacles, color=INK)
     for (name, aside), place in things.items():
         x, y = project(place[None], camera, size)[0]
-        axis.annotate(
+        note = axis.annotate(
             name,
             (x, y),
             xytext=aside,
@@ -104,6 +104,7 @@ def draw(
             path_effects=[withStroke(linewidth=3, foreground="white")],
             arrowprops={"arrowstyle": "-", "color": INK, "lw": 1, "shrinkB": 4},
         )
+        note.set_in_layout(False)
 
 
 def names(state: ArmState, env: ArmEnv) -> dict[tuple[str, tuple[int, int]], NDArray[Any]]:

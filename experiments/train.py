@@ -30,7 +30,7 @@ from experiments.demonstrations import start_from_demonstrations
 from experiments.files import is_new, write_whole
 from experiments.film import save_film
 from experiments.grid import side_by_side
-from experiments.log import Log, figures, score, summed_costs, versions
+from experiments.log import Log, figures, progress_text, score, summed_costs, versions
 from experiments.report import plot_curves, save_picture, table
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
 from torchrl_safe.collectors import ResumableCollector
@@ -222,8 +222,8 @@ def train(
         tqdm(
             total=config.frames,
             desc=algorithm,
-            unit="frame",
-            unit_scale=True,
+            # Rates and counts would push off the line what one wants to know.
+            bar_format="{desc} {percentage:3.0f} % |{bar:20}| {remaining} left{postfix}",
             disable=not progress,
             position=line,
         ) as bar,
@@ -255,7 +255,7 @@ def train(
             bar.update(batch.numel())
             row = figures(episodes, training.loss, costs)
             row |= summed_costs(batch, log.rows, costs)
-            bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
+            bar.set_postfix_str(progress_text(row, config.cost_limits))
             log.add({"frames": log.frames + batch.numel(), **row})
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
                 recent = log.rows[-config.checkpoint_every :]
@@ -344,9 +344,7 @@ def film(config: Config, path: Path, *, seed: int, **options: Any) -> None:
         for name in config.chosen
     }
     try:
-        save_film(
-            actors, path, seed=seed, limits=dict.fromkeys(COSTS, config.cost_limit), **options
-        )
+        save_film(actors, path, seed=seed, limits=config.cost_limits, **options)
     finally:
         for env, _ in actors.values():
             env.close()

@@ -28,7 +28,7 @@ def test_torchrl_films(make_env, tmp_path):
 
 
 def test_gallery(tmp_path, engine):
-    main(Config(physics=engine, out=tmp_path / "new" / "gallery.png", width=40, steps=1))
+    main(Config(physics=engine, out=tmp_path / "new" / "gallery.png", width=100, steps=1))
     with Image.open(tmp_path / "new" / "gallery.png") as gallery:
-        assert gallery.width >= 3 * 40
+        assert gallery.width >= 3 * 100
         assert len(gallery.convert("RGB").getcolors(10**6)) > 1000
