@@ -60,7 +60,7 @@ def test_its_policy_is_evaluated_in_its_task(trained, capsys):
     _, file = trained
     config = evaluate.Config(file, episodes=4, envs=4)
     saved = load_policy(file)
-    assert evaluate.cost_limits(config, saved) == (0.5, 1.0)
+    assert evaluate.cost_limits(config, saved) == tuple(SUITE[NAME].cost_limits.values())
     env = evaluate.factory(config, saved)(num_envs=1)
     assert isinstance(env.base_env.obstacles, Human)
     assert isinstance(env.base_env.costs["separation"], SpeedAndSeparation)
@@ -69,7 +69,8 @@ def test_its_policy_is_evaluated_in_its_task(trained, capsys):
     shown = capsys.readouterr().out
     for heading in ("episode cost: separation", "episodes above the limit of collision"):
         assert heading in shown
-    assert "Cost limits collision 0.5, separation 1; brackets" in shown
+    limits = SUITE[NAME].cost_limits
+    assert f"Cost limits collision 0.5, separation {limits['separation']:g}; brackets" in shown
 
 
 def test_costs_are_chosen_each_with_a_limit():
@@ -96,7 +97,7 @@ def test_every_limit_is_a_budget(algorithm):
     config = suite_config(NAME, physics="mujoco")
     env = train.make_env(config, num_envs=1, algorithm=algorithm, training=True)
     (transform,) = (each for each in env.transform if hasattr(each, "budget"))
-    assert transform.budget.tolist() == [0.5, 1.0]
+    assert transform.budget.tolist() == [*SUITE[NAME].cost_limits.values()]
     env.close()
 
 

@@ -32,6 +32,7 @@ from torchrl_safe.envs import (
 from torchrl_safe.policy import save_policy
 
 NAME = "panda-reach-human"
+LIMIT = SUITE[NAME].cost_limits["separation"]
 FAST = MuJoCo(threads=1)
 
 
@@ -156,17 +157,18 @@ def test_table_and_folder(tmp_path, capsys):
     transfer.main(config)
     lines = capsys.readouterr().out.splitlines()
     row = next(line for line in lines if line.startswith("| mine |"))
-    assert row.startswith("| mine | collision 0.5, separation 1 | ")
+    assert row.startswith(f"| mine | collision 0.5, separation {LIMIT:g} | ")
     assert row.endswith("|  |")
     (last,) = (line for line in lines if line.startswith("| within every limit"))
     assert last.endswith("| 0/0 |")
 
 
 def test_costs_above_their_limits_are_bold():
-    figures = {"success": [0.5], "cost/collision": [0.5], "cost/separation": [1.01]}
+    figures = {"success": [0.5], "cost/collision": [0.5], "cost/separation": [LIMIT + 0.01]}
     run = {"policy": "p", "task": NAME, "condition": "delay", "evaluation": figures}
     row, counts = transfer.table([run]).splitlines()[2:4]
-    assert row == "| p | collision 0.5, separation 1 | 50%; 0.50, **1.01** |"
+    shown = f"**{LIMIT + 0.01:.2f}**"
+    assert row == f"| p | collision 0.5, separation {LIMIT:g} | 50%; 0.50, {shown} |"
     assert counts == "| within every limit | | 0/1 |"
 
 
