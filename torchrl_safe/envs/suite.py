@@ -120,8 +120,8 @@ _BESIDE_A_PERSON: dict[str, Cost] = {
     "collision": Collision(),
     "separation": SpeedAndSeparation(),
 }
-# Who hardly waits is there before the arm has passed. Where the arm is at home, the person leaves it
-# alone: it has to learn how to reach beside the person, not how to get away.
+# Who hardly waits is there before the arm has passed. At home the arm is left alone: it has to
+# learn how to reach beside the person, not how to get away.
 _BUSY_PERSON = Human(shoulder=(1.2, 0.25, 0.4), rest=(1.0, 0.3, 0.2), pause=(0.05, 0.3))
 
 
