@@ -29,9 +29,9 @@ from torchrl_safe.envs.state import Array
 _LOW = 0.033
 # How far above the obstacles, and without any above the table, the tool goes over to the object.
 _OVER, _ABOVE_TABLE = 0.13, 0.12
-# How far the tool goes in a control step beside what moves, m; how far off that is to be, or the
-# tool goes back, m; from how much more on it goes more slowly, m; and how far what comes nearer goes
-# in what time is to be added to that, s.
+# How far the tool goes in a control step beside what moves, m. How far off that is to be, or the
+# tool goes back, m; where that is not much, it slows down, m. What comes nearer counts as where it
+# will be in some time, s.
 _PACE, _ROOM, _SLOWER, _TIME = 0.027, 0.11, 0.1, 0.5
 # What of the hand is to be out of the way: heights above the tool point, and half its width, m.
 _HAND, _HALF_WIDTH = (0.0, 0.1, 0.2), 0.07

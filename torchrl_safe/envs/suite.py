@@ -51,7 +51,7 @@ class SuiteTask:
     Examples:
         >>> task = SUITE["panda-reach-human"]
         >>> dict(task.cost_limits)
-        {'collision': 0.5, 'separation': 0.5}
+        {'collision': 0.5, 'separation': 1.0}
         >>> env = task.make_env(num_envs=2, seed=0)
         >>> env.cost_names, env.max_episode_steps
         (('collision', 'separation'), 60)
@@ -120,8 +120,9 @@ _BESIDE_A_PERSON: dict[str, Cost] = {
     "collision": Collision(),
     "separation": SpeedAndSeparation(),
 }
-# Who hardly waits is there before the arm has passed.
-_BUSY_PERSON = Human(pause=(0.05, 0.3))
+# Who hardly waits is there before the arm has passed. At home the arm is left alone: it has to
+# learn how to reach beside the person, not how to get away.
+_BUSY_PERSON = Human(shoulder=(1.2, 0.25, 0.4), rest=(1.0, 0.3, 0.2), pause=(0.05, 0.3))
 # Far enough away that there is room to step back from the hand, and time to push.
 _PERSON_OPPOSITE = Human(shoulder=(1.25, 0.3, 0.4), rest=(1.0, 0.35, 0.2))
 
@@ -155,9 +156,9 @@ SUITE: dict[str, SuiteTask] = {
             Reach(),
             _BUSY_PERSON,
             _BESIDE_A_PERSON,
-            {"collision": 0.5, "separation": 0.5},
-            # 0.5 m/s along each axis: fast enough to get out of the person's way.
-            CartesianDelta(step=0.025),
+            {"collision": 0.5, "separation": 1.0},
+            # 0.4 m/s along each axis.
+            CartesianDelta(step=0.02),
         ),
         SuiteTask(
             "iiwa-reach-joints",
