@@ -306,7 +306,7 @@ def suite_config(name: SuiteTaskName, **others: Any) -> Config:
     if name not in SUITE:
         raise ValueError(f"suite_task must be one of {', '.join(SUITE)}, got {name!r}.")
     task = SUITE[name]
-    chosen = {"frames": task.frames, **_SUITE_KINDS[type(task.task)], **others}
+    chosen = {**_SUITE_KINDS[type(task.task)], "frames": task.frames, **others}
     return Config(**{**chosen, "suite_task": name})
 
 

@@ -179,6 +179,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM6),
             max_episode_steps=200,
+            frames=131_072,
         ),
         SuiteTask(
             "panda-push-human",
@@ -189,6 +190,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5, "separation": 2.0},
             _handling(PANDA),
             max_episode_steps=200,
+            frames=131_072,
         ),
         SuiteTask(
             "panda-pick-in-front",
@@ -199,6 +201,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
         SuiteTask(
             "ur10-pick-workspace",
@@ -212,6 +215,7 @@ SUITE: dict[str, SuiteTask] = {
             {"workspace": 0.5, "contact-force": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
         SuiteTask(
             "xarm7-pick-scattered",
@@ -222,6 +226,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
     )
 }
