@@ -4,6 +4,8 @@ import sys
 from importlib.metadata import version as installed
 from pathlib import Path
 
+from sphinx_gallery.sorting import ExplicitOrder
+
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "torchrl-safe"
@@ -36,11 +38,29 @@ html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 napoleon_use_ivar = True
-# `make test` runs the tutorials.
+# The order in which they are shown; those that it does not name come before the last two.
+TUTORIALS = [
+    "first_policy.py",
+    "own_loop.py",
+    "several_limits.py",
+    "own_arm.py",
+    "own_task.py",
+    "any_environment.py",
+    "off_policy.py",
+    "own_loss.py",
+    "*",
+    "deploy.py",
+    "safe_while_it_learns.py",
+]
+# Each runs in one of two processes, unless it has not changed since the last build; one that fails
+# fails the build.
 sphinx_gallery_conf = {
     "examples_dirs": "../tutorials",
     "gallery_dirs": "tutorials",
-    "plot_gallery": False,
+    "filename_pattern": r"\.py$",
+    "within_subsection_order": ExplicitOrder(TUTORIALS),
+    "parallel": 2,
+    "remove_config_comments": True,
     "show_memory": False,
     "download_all_examples": False,
     "write_computation_times": False,  # Their page loads scripts from elsewhere.
