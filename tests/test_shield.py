@@ -205,8 +205,8 @@ def test_a_distance_leaves_room_to_stop_in(make_env, engine, turntable):
     """By hand: a third of 10 rad/s^2 at a lever of 0.45 m, over 1/20 s."""
     shield = Shield(margin=0.02, rate=1e3)
     env = turn(make_env, turntable, (0.45, 0.25, 0.5), shield=shield)
-    brake = 0.35 * 10 * 0.05**2 * 0.45
-    allowed = (np.sqrt(brake**2 + 2 * brake * 0.08) - brake) / 0.45
+    brake = 10 * 0.05**2 * 0.45 / 3
+    allowed = (np.sqrt(brake**2 / 4 + 2 * brake * 0.08) - brake / 2) / 0.45
     # A little more: what is nearest at the end of the step is another point.
     assert env.arm_state.shield_correction[0] == pytest.approx(0.1 - allowed, abs=2e-3)
     assert not env.arm_state.shield_braked[0]

@@ -21,7 +21,7 @@ _ERROR = 0.1
 # Of what the joints hardly move, m/rad, and of joints without limits, rad.
 _SHORTEST, _FAR = 1e-3, 1e3
 # Of what the joints can do to stop, the part that is counted on: others may have to turn on.
-_SURE = 0.35
+_SURE = 1 / 3
 
 
 class Shielded(NamedTuple):
@@ -86,12 +86,12 @@ class Shield:
     Sreenath 2017, RSS), with which the arm can always stop:
 
     .. math::
-        s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\ \sqrt{b^2 + 2 b r} - b\right),
-        \qquad b = 0.35\ \text{acceleration} \cdot T^2\, |\nabla d|_1
+        s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\ \sqrt{b^2 / 4 + 2 b r} - b / 2\right),
+        \qquad b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
 
     The first part is a share of the room. The second is as much as leaves room to stop in, where
-    the distance shrinks by b less in each following step: about a third of what all joints
-    together can do. In negative room, inside the margin, :math:`s = (1 - e^{-\text{rate} \cdot T})
+    the distance shrinks by b less in each following step: a third of what all joints together
+    can do. In negative room, inside the margin, :math:`s = (1 - e^{-\text{rate} \cdot T})
     r` has the arm go away.
 
     The bounds l and u keep joints within their limits and speeds, and within what motors can
@@ -259,10 +259,9 @@ class Shield:
         # From one step to the next, the joints can make a distance shrink by that much less.
         brake = self.acceleration * step.duration**2 * _SURE * np.abs(joints).sum(axis=2)
         some = np.where(np.isfinite(room), np.maximum(room, 0), 0.0)
-        # With x in this step, x + x**2 / (2 brake) until it stands still.
-        return np.where(
-            room > 0, np.minimum(share, np.sqrt(brake * (brake + 2 * some)) - brake), share
-        )
+        # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
+        stops = np.sqrt(brake * (brake / 4 + 2 * some)) - brake / 2
+        return np.where(room > 0, np.minimum(share, stops), share)
 
     def _least(self, step: _Step, now: _Pairs) -> Array:
         """By how much each distance has to change at least, m, ``(N, r)``."""
