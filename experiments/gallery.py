@@ -1,4 +1,4 @@
-"""Draws six environments, with what is in them named: ``make gallery``."""
+"""Draws environments, with what is in them named: ``make gallery``."""
 
 from __future__ import annotations
 
@@ -37,17 +37,23 @@ SCENES = (
     ("XArm6", "Push", "Moving", 0),
     ("UR10", "PickAndPlace", "Human", 1),
 )
+#: The pictures of the pages of the tasks, by their file names.
+TASK_SCENES = {
+    "reach": ("Panda", "Reach", "InFront", 22),
+    "push": ("Panda", "Push", "InFront", 4),
+    "pick_and_place": ("Panda", "PickAndPlace", "InFront", 4),
+}
 _COLUMNS = 3
 
 
 @dataclass(frozen=True)
 class Config:
-    """Draw six environments."""
+    """Draw six environments, and each task."""
 
     physics: Engine = "mujoco"
     """Engine that simulates and draws them."""
     out: Path = Path("runs/gallery.png")
-    """File of the picture."""
+    """File of the six; the pictures of the tasks are put beside it."""
     width: int = 420
     """Width of each tile in pixels; its height is three quarters of that."""
     steps: int = 14
@@ -55,7 +61,8 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Draws and saves the pictures."""
+    """Draws and saves the gallery, and beside it the pictures of the tasks."""
+    config.out.parent.mkdir(parents=True, exist_ok=True)
     size = (config.width, config.width * 3 // 4)
     rows = -(-len(SCENES) // _COLUMNS)
     with figure_style():
@@ -68,9 +75,14 @@ def main(config: Config) -> None:
         scenes = tqdm(SCENES, desc="gallery", unit="picture")
         for axis, (*parts, seed) in zip(grid.flat, scenes, strict=True):
             draw(axis, parts, seed, config, size)
-        config.out.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(config.out, dpi=100)
         plt.close(figure)
+        for name, (*parts, seed) in TASK_SCENES.items():
+            figure, axis = plt.subplots(figsize=(size[0] / 75, size[1] / 75), layout="constrained")
+            draw(axis, parts, seed, config, size)
+            axis.set_title("")
+            figure.savefig(config.out.with_name(f"{name}.png"), dpi=100)
+            plt.close(figure)
 
 
 def draw(

@@ -357,7 +357,7 @@ def test_bad_settings(settings, message):
     ("task", "kind", "step", "fingers", "steps"),
     [
         ("reach", Reach, 0.05, 0, 40),
-        ("push", Push, 0.03, 0, 100),
+        ("push", Push, 0.03, 0, 200),
         ("pick-and-place", PickAndPlace, 0.03, 1, 100),
     ],
 )
