@@ -167,6 +167,11 @@ class Config:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
         if self.demonstrations < 0:
             raise ValueError(f"demonstrations must not be negative, got {self.demonstrations}.")
+        if self.demonstrations and self.action == "joint":
+            raise ValueError(
+                f"demonstrations must be 0 with joint actions, got {self.demonstrations}: pilots "
+                "say where the tool is to go."
+            )
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
         for cost, limit in self.costs.items():
@@ -223,7 +228,8 @@ class Config:
         """The limit of each cost, by its name and in the order of the costs."""
         if self.suite_task is not None:
             return dict(SUITE[self.suite_task].cost_limits)
-        return {**self.costs} or {"collision": self.cost_limit}
+        chosen = {str(name): limit for name, limit in self.costs.items()}
+        return chosen or {"collision": self.cost_limit}
 
     @property
     def chosen(self) -> tuple[AlgorithmName, ...]:
@@ -247,8 +253,8 @@ class Config:
 
 
 _HANDLING = {
-    "demonstrations": 65_536,
-    "frames": 262_144,
+    "demonstrations": 98_304,
+    "frames": 196_608,
     "envs": 64,
     "frames_per_batch": 4096,
     "minibatch": 512,

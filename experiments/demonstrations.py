@@ -9,8 +9,8 @@ says in every state what it would have done, which is what the policy learns (DA
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -28,9 +28,11 @@ from torchrl_safe.envs import ArmEnv
 
 # Share of the control steps in which the pilot acts, and the deviation of its noise.
 _FIRST, _NOISE = 0.25, 0.2
-# Control steps of each world between two times of learning, and minibatches learnt from then; in
-# the end, when all have been seen; their size, and Adam's learning rate, which falls to 0 then.
-_STEPS, _MINIBATCHES, _LAST, _SIZE, _RATE = 32, 100, 2500, 1024, 2e-3
+# Control steps of each world between two times of learning. As many as there are new ones are then
+# drawn so many times from all; in the end, all of them.
+_STEPS, _TIMES, _LAST_TIMES = 32, 50, 40
+# Control steps in a minibatch, and Adam's learning rate, which falls to 0 in the end.
+_SIZE, _RATE = 512, 5e-3
 # How often the critics look again at what the learnt policy has earned and cost, and how long.
 _LOOKS, _PASSES = 6, 4
 
@@ -45,7 +47,8 @@ def start_from_demonstrations(training: Training, env: TransformedEnv, config: C
     """
     imitation = Imitation(training.actor)
     stage = Stage(env)
-    rounds = max(2, round(config.demonstrations / (_STEPS * env.batch_size.numel())))
+    new = _STEPS * env.batch_size.numel()
+    rounds = max(2, round(config.demonstrations / new))
     flown = max(1, round(_FIRST * rounds))
     for index in range(rounds):
         if index < flown:
@@ -53,9 +56,9 @@ def start_from_demonstrations(training: Training, env: TransformedEnv, config: C
             continue
         if index == flown:
             standardize(training.loss, imitation.seen["observation"])
-        imitation.learn(_MINIBATCHES)
+        imitation.learn(_TIMES * new)
         imitation.add(stage.play(_STEPS, training.actor))
-    imitation.learn(_LAST, settle=True)
+    imitation.learn(_LAST_TIMES * rounds * new, settle=True)
     played = Stage(env).play(env.base_env.max_episode_steps, training.actor)
     fit_critics(training.loss, played, config.learning_rate)
 
@@ -109,8 +112,9 @@ class Imitation:
         new = played.select(*self.actor.in_keys).set("action", played["advice"]).reshape(-1)
         self.seen = torch.cat([self.seen, new]) if len(self.seen) else new
 
-    def learn(self, minibatches: int, *, settle: bool = False) -> None:
-        """Learns from all that was remembered; to settle, with a rate that falls to 0."""
+    def learn(self, steps: int, *, settle: bool = False) -> None:
+        """Learns from steps drawn from all that it remembers; to settle, at a rate that falls."""
+        minibatches = math.ceil(steps / _SIZE)
         for index in range(minibatches):
             self.optimizer.param_groups[0]["lr"] = _RATE * (1 - settle * index / minibatches)
             minibatch = self.seen[torch.randint(len(self.seen), (_SIZE,))]
@@ -131,9 +135,8 @@ def standardize(loss: LossModule, seen: Tensor) -> None:
 
 def fit_critics(loss: LossModule, played: TensorDictBase, rate: float) -> None:
     """Fits the critics to what the policy has earned and cost; it stays as it is."""
-    critics: dict[str, Any] = dict(loss.named_parameters())
-    critics = {name: each for name, each in critics.items() if "critic" in name}
-    optimizer = torch.optim.Adam(critics.values(), lr=2 * rate, fused=True)
+    critics = [each for name, each in loss.named_parameters() if "critic" in name]
+    optimizer = torch.optim.Adam(critics, lr=2 * rate, fused=True)
     for _ in range(_LOOKS):
         data = loss.estimate_advantages(played.clone(False)).reshape(-1).exclude("next")
         for _ in range(_PASSES):

@@ -1,7 +1,8 @@
 """Plays with a policy that was saved: how good it is, how safe, and what it looks like.
 
 ``python -m experiments.evaluate --policy runs/x/ppo-lagrangian/policy.pt`` plays in the environment
-of its training; ``--env my_module:make_env`` in one of your own.
+of its training, ``--policy panda-reach-in-front`` with a policy that comes with the package, and
+``--env my_module:make_env`` in an environment of your own.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class Config:
     """Evaluate a policy that was saved on its own."""
 
     policy: Path
-    """File that training has written: runs/.../policy.pt."""
+    """File that training has written, runs/.../policy.pt, or the name of a policy that comes with
+    the package, such as panda-reach-in-front."""
     env: str | None = None
     """An environment of your own, as module:function. Called as function(num_envs=...), it
     returns an ArmEnv, or any environment with reward and cost. Without it, the environment that

@@ -7,12 +7,22 @@ and it can tell what is right wherever that network has got to (:mod:`experiment
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from torchrl_safe.envs import ArmEnv, ArmState, CartesianDelta, PickAndPlace, Push, Reach, Task
+from torchrl_safe.envs import (
+    ArmEnv,
+    ArmState,
+    CartesianDelta,
+    Human,
+    Moving,
+    PickAndPlace,
+    Push,
+    Reach,
+    Task,
+)
 from torchrl_safe.envs.state import Array
 
 # Where the fingers' ends, 1 cm below the tool point, take the upper half of a cube, m.
@@ -149,6 +159,9 @@ PILOTS: dict[type[Task], Pilot] = {
 def make_pilot(env: ArmEnv) -> Pilot:
     """Makes the pilot of an environment's task.
 
+    It looks at what stands in the way, not at what moves: where that will be it cannot know, and
+    costs are to teach it to a policy.
+
     Raises:
         ValueError: if the task has none, or its actions do not move the tool.
     """
@@ -156,8 +169,18 @@ def make_pilot(env: ArmEnv) -> Pilot:
         raise ValueError(f"demonstrations need Cartesian actions, got {env.action_mode}.")
     for task, pilot in PILOTS.items():
         if isinstance(env.task, task):
-            return pilot
+            return _blind(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
     raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
+
+
+def _blind(pilot: Pilot) -> Pilot:
+    """The pilot where no obstacles are."""
+
+    def fly(state: ArmState) -> tuple[Array, Array]:
+        nothing = np.zeros_like(state.obstacle_present)
+        return pilot(replace(state, obstacle_present=nothing))
+
+    return fly
 
 
 def _from_above(tool: Array, place: Array, top: Array, slack: float = 0.0) -> Array:

@@ -63,6 +63,11 @@ class Config:
             raise ValueError(f"eval_episodes must be at least 2, got {self.eval_episodes}.")
 
 
+def folder(out: Path, task: str, seed: int) -> Path:
+    """Where the runs of a task and a seed leave their checkpoints and policies."""
+    return out / "runs" / task / str(seed)
+
+
 def run(config: TrainConfig, algorithm: AlgorithmName, definition: str) -> dict[str, Any]:
     """One run. The definition of its task is kept with it: another one's results are refused."""
     return train.run(config, algorithm)
@@ -80,7 +85,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName, str]]:
                 seed=seed,
                 eval_episodes=config.eval_episodes,
                 workers=1,
-                out=config.out / "runs" / task / str(seed),
+                out=folder(config.out, task, seed),
                 resume=True,
             ),
             algorithm,
@@ -92,13 +97,13 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName, str]]:
 
 def draw_scenes(config: Config) -> None:
     """Saves a picture of each task: the first world of a seed, some control steps after a reset."""
-    folder = config.out / "pictures"
-    folder.mkdir(parents=True, exist_ok=True)
+    pictures = config.out / "pictures"
+    pictures.mkdir(parents=True, exist_ok=True)
     for name in config.tasks:
         physics = train.PHYSICS[config.physics]
         env = SUITE[name].make_env(physics=physics, seed=1)
         env.rollout(10, lambda td: td.set("action", env.action_spec.zero()))  # noqa: B023
-        plt.imsave(folder / f"{name}.png", env.render(480, 360, CAMERA)[0].numpy())
+        plt.imsave(pictures / f"{name}.png", env.render(480, 360, CAMERA)[0].numpy())
         env.close()
 
 
@@ -110,7 +115,7 @@ def main(config: Config) -> None:
         {"task": settings.suite_task, "algorithm": algorithm, "seed": settings.seed, **result}
         for (settings, algorithm, _), result in zip(grid.values(), results, strict=True)
     ]
-    limits = {name: dict(SUITE[name].cost_limits) for name in config.tasks}
+    limits = {run["task"]: dict(SUITE[run["task"]].cost_limits) for run in runs}
     save_results(config.out, config, runs, report(runs, limits))
     plot_profiles(runs, limits, config.out / "profiles.png")
     plot_training(runs, limits, config.out / "training.png")

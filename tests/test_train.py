@@ -339,6 +339,15 @@ def test_noise_falls_from_batch_to_batch():
         ({"minibatch": 0}, "minibatch must be at least 1, got 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be positive, got nan"),
         ({"cost_limit": -1.0}, "cost_limit must not be negative, got -1.0"),
+        ({"demonstrations": -1}, "demonstrations must not be negative, got -1"),
+        (
+            {"demonstrations": 1, "algorithms": ("sac-lagrangian",)},
+            "demonstrations must be 0 with sac-lagrangian, which learns off policy, got 1",
+        ),
+        (
+            {"demonstrations": 1, "action": "joint"},
+            "demonstrations must be 0 with joint actions, got 1",
+        ),
         ({"algorithms": ()}, "algorithms must name at least one"),
         ({"algorithms": ("cpo", "td3-lagrangian"), "paper": True}, "not contain td3-lagrangian"),
         ({"algorithms": ("ppo-saute",), "cost_limit": 0.0}, "cost_limit must be positive with ppo"),

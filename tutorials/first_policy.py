@@ -12,18 +12,18 @@ on its collisions, and film both. This is the picture at the end:
 Both together take about a minute and a half on one core.
 """
 
-# sphinx_gallery_thumbnail_number = -1
-
 # %%
 # The environment
 # ---------------
 #
-# An ``ArmEnv`` is put together from an arm, an action representation, a
-# task, obstacles, costs and a physics engine. Only the costs are given here. The rest are
-# defaults: a Panda that moves its tool by up to 5 cm in each step, a target to reach, one
-# obstacle in front of it. ``num_envs`` worlds run side by side.
+# An ``ArmEnv`` is put together from an arm, actions, a task, obstacles, costs and a physics
+# engine. Costs and engine are given here. The rest are defaults: a Panda that moves its tool by
+# up to 5 cm in each step, a target to reach, one obstacle in front of it. ``num_envs`` worlds run
+# side by side.
 #
 # ``cost`` is a second reward. TorchRL's ``RewardSum`` adds up both over an episode.
+
+# sphinx_gallery_thumbnail_number = -1
 
 import matplotlib.pyplot as plt
 import torch
@@ -51,14 +51,14 @@ def make_env(num_envs=32, seed=0, engine=MuJoCo):
 
 
 env = make_env()
-print(env.rollout(3))
+print(env.rollout(3)["next"].select("observation", "reward", "cost", "success", "done"))
 
 # %%
 # The networks
 # ------------
 #
 # There are three: a policy, a critic of the reward, and a critic of the costs with one output for
-# each cost. Two details decide whether they learn in a minute or in ten:
+# each cost. Two details make them learn faster:
 #
 # - Goals differ by centimetres, which a small network that is given metres hardly sees. So each
 #   network first standardizes its input, by what random actions bring about.

@@ -115,8 +115,11 @@ class SuiteTask:
         return ArmEnv(**self.arguments, **settings)
 
 
-_ONE_TOUCH = {"collision": Collision()}
-_BESIDE_A_PERSON = {"collision": Collision(), "separation": SpeedAndSeparation()}
+_ONE_TOUCH: dict[str, Cost] = {"collision": Collision()}
+_BESIDE_A_PERSON: dict[str, Cost] = {
+    "collision": Collision(),
+    "separation": SpeedAndSeparation(),
+}
 # Who hardly waits is there before the arm has passed.
 _BUSY_PERSON = Human(pause=(0.05, 0.3))
 
