@@ -41,16 +41,16 @@ _PHYSICS = "physics."
 class ArmEnv(EnvBase):
     """A robot arm that has a task to do and costs to keep low.
 
-    The environment is batched: each of its N rows is a world of its own, and all of them run in this
-    process. You can combine any arm with any action, task, obstacles, costs and physics.
+    The environment is batched: each of its N rows is a world of its own, and all of them run in
+    this process. You can combine any arm with any action, task, obstacles, costs and physics.
 
     For N worlds and k costs it writes ``observation`` (N, width) and reads ``action`` (N, width).
     Under ``"next"`` it also writes ``reward`` (N, 1), ``cost`` (N, k), ``success`` (N, 1),
-    ``terminated`` (N, 1; the task is done), ``truncated`` (N, 1; the time is up) and ``done`` (N, 1).
-    ``cost`` is part of the reward spec, like ``reward``. TorchRL's
-    ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])`` therefore sums both over an
-    episode. With a shield there are also ``shield_correction`` (N, 1; how far it has moved the joint
-    targets, rad) and ``shield_braked`` (N, 1; whether it held the arm still).
+    ``terminated`` (N, 1; the task is done), ``truncated`` (N, 1; the time is up) and ``done``
+    (N, 1). ``cost`` is part of the reward spec, like ``reward``. TorchRL's
+    ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])`` therefore sums both over
+    an episode. With a shield there are also ``shield_correction`` (N, 1; how far it has moved the
+    joint targets, rad) and ``shield_braked`` (N, 1; whether it held the arm still).
 
     Attributes:
         observation_fields: the slice of the observation that each field has, by name.
