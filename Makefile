@@ -16,7 +16,7 @@ NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrai
 	trust_region_optimum trust_region_step violation))
 
 .PHONY: train test test-kernels test-slow test-wheel test-safety-gymnasium safe-gym safe-gym-grid \
-	bench-omnisafe compare paper sweep profile gallery bench draws attack ray docs lint format type clean
+	bench-omnisafe compare suite paper sweep profile gallery bench draws attack ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 	$(BIN)/python -m experiments.train $(ARGS)
@@ -54,6 +54,9 @@ test-wheel:  ## the package as people get it: an empty environment, with and wit
 compare: $(READY)  ## every algorithm on the same task; goes on where it was stopped
 	$(BIN)/python -m experiments.compare $(ARGS)
 
+suite: $(READY)  ## ten tasks with their limits, five seeds; goes on where it was stopped
+	$(BIN)/python -m experiments.suite $(ARGS)
+
 paper: $(READY)  ## Table 1 and Figure 2 of the paper, run again; goes on where it was stopped
 	$(BIN)/python -m experiments.paper $(ARGS)
 
@@ -75,7 +78,7 @@ attack: $(READY)  ## tries to make a shielded arm touch something: ARGS="--steps
 ray: $(READY)  ## two costs on a Ray cluster; on this machine, or on yours with ARGS="--address auto"
 	$(BIN)/python -m experiments.ray_training $(ARGS)
 
-gallery: $(READY)  ## the contact sheet of docs/environments.md
+gallery: $(READY)  ## the pictures of docs/environments.md
 	$(BIN)/python -m experiments.gallery --out docs/figures/gallery.png $(ARGS)
 
 docs: $(READY)  ## these pages, the tutorials (run where new) and the API reference, in docs/_build

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.data import Composite
 from torchrl.envs import CatTensors, EnvBase, Transform
@@ -42,7 +43,7 @@ from torchrl_safe.objectives import (
 )
 
 Updater = MultiplierUpdater | ViolationUpdater
-# Called as rule(loss, rate, cost_limit=, pessimism=).
+# Called as rule(loss, rate, cost_limit=, cost_names=, pessimism=).
 MULTIPLIER_RULES: dict[str, Callable[..., MultiplierUpdater]] = {
     "pid": lambda loss, rate, **settings: PIDControl(loss, ki=rate, **settings),
     "dual-ascent": lambda loss, rate, **settings: DualAscent(
@@ -77,6 +78,10 @@ class Training:
         return state if self.updater is None else {**state, "updater": self.updater}
 
 
+def _limits(config: Config) -> dict[str, Any]:
+    return {"cost_limit": config.cost_limits, "cost_names": tuple(config.cost_limits)}
+
+
 def keep_multiplier(loss: LossModule, config: Config) -> None:
     """No rule: the multiplier stays where it starts."""
 
@@ -88,14 +93,14 @@ def move_multiplier(loss: LossModule, config: Config) -> Updater | None:
     return MULTIPLIER_RULES[config.multiplier_rule](
         loss,
         config.multiplier_rate,
-        cost_limit=config.cost_limit,
+        **_limits(config),
         pessimism=config.pessimism,
     )
 
 
 def tell_violation(loss: LossModule, config: Config) -> Updater:
     """No multiplier: the loss reads the violation itself."""
-    return ViolationUpdater(loss, cost_limit=config.cost_limit, pessimism=config.pessimism)
+    return ViolationUpdater(loss, **_limits(config), pessimism=config.pessimism)
 
 
 def tell_mean_violation(loss: LossModule, config: Config) -> Updater:
@@ -104,7 +109,7 @@ def tell_mean_violation(loss: LossModule, config: Config) -> Updater:
     Two standard errors are more than a limit of rare costs: such a loss then keeps the arm away
     from everything before it has learnt to reach.
     """
-    return ViolationUpdater(loss, cost_limit=config.cost_limit)
+    return ViolationUpdater(loss, **_limits(config))
 
 
 def no_transforms(config: Config) -> list[Transform]:
@@ -250,15 +255,19 @@ def _of_ppo(make: Callable[..., LossModule]) -> Any:
     return partial(make, **_OPTIONS)
 
 
+def _budgets(config: Config) -> torch.Tensor:
+    return torch.tensor([*config.cost_limits.values()])
+
+
 def _with_budget(config: Config) -> list[Transform]:
     # The reward of a step is around -1 and better.
-    saute = Saute(config.cost_limit, unsafe_reward=-2.0)
+    saute = Saute(_budgets(config), unsafe_reward=-2.0)
     return [saute, CatTensors(["observation", "remaining_budget"], "observation", del_keys=False)]
 
 
 def _terminating(config: Config) -> list[Transform]:
     # Worse than any episode, or an early end would be a way out.
-    return [EarlyTermination(config.cost_limit, termination_reward=-20.0)]
+    return [EarlyTermination(_budgets(config), termination_reward=-20.0)]
 
 
 ALGORITHMS: dict[str, Algorithm] = {

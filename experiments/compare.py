@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 import matplotlib.pyplot as plt
-import torch
+import numpy as np
 import tyro
 
 from experiments import train
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine
 from experiments.grid import run_grid, save_results
 from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
+from experiments.style import LIGHT, colour, cost_axis, figure_style, label, limit_line
 from torchrl_safe.metrics import worst_seed
 
 
@@ -91,26 +92,49 @@ def table(runs: list[dict[str, Any]], cost_limit: float) -> str:
 
 
 def plot(runs: list[dict[str, Any]], cost_limit: float, path: Path) -> None:
-    """Draws return against cost: the mean of each algorithm, named, and its seeds."""
-    figure, axis = plt.subplots(figsize=(7.4, 5.2))
-    for index, algorithm in enumerate(dict.fromkeys(run["algorithm"] for run in runs)):
-        colour = plt.get_cmap("tab20")(index)
-        points = torch.tensor(
-            [
-                [run["evaluation"][name][0] for name in ("cost/collision", "return")]
-                for run in runs
-                if run["algorithm"] == algorithm
-            ]
+    """Draws return against cost, a panel for each algorithm: its seeds among all others."""
+    names = list(dict.fromkeys(run["algorithm"] for run in runs))
+    points = {name: _points(runs, name) for name in names}
+    everyone = np.concatenate(list(points.values()))
+    columns = min(len(names), 6)
+    rows = -(-len(names) // columns)
+    with figure_style():
+        figure, grid = plt.subplots(
+            rows,
+            columns,
+            figsize=(2.1 * columns + 0.8, 2.0 * rows + 0.5),
+            sharex=True,
+            sharey=True,
+            squeeze=False,
+            layout="constrained",
         )
-        axis.plot(*points.T, ".", color=colour, alpha=0.5)
-        axis.plot(*points.mean(0), "o", color=colour, label=algorithm)
-    axis.axvline(cost_limit, color="black", ls="--", label="limit")
-    axis.set(xlabel="evaluated episode cost", ylabel="evaluated return", xscale="symlog")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=7, ncols=2)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+        cost_axis(grid[0, 0], "x", max(everyone[:, 0].max(), cost_limit))
+        grid[0, 0].set_xlim(-0.02, 1.5 * max(everyone[:, 0].max(), cost_limit))
+        for axis in grid.flat[len(names) :]:
+            axis.set_visible(False)
+        for axis, name in zip(grid.flat, names, strict=False):
+            axis.plot(*everyone[:, :2].T, "o", color=LIGHT, ms=3, zorder=1)
+            axis.plot(*points[name][:, :2].T, "o", color=colour(name), ms=7, mec="white", zorder=3)
+            limit_line(axis, cost_limit, vertical=True)
+            success = f"success {points[name][:, 2].mean():.0%}"
+            axis.set_title(f"{label(name)}\n{success}", fontsize=9)
+            axis.tick_params(axis="x", labelsize=7)
+        figure.supxlabel("cost of an evaluated episode", fontsize=9)
+        figure.supylabel("return", fontsize=9)
+        figure.savefig(path)
+        plt.close(figure)
+
+
+def _points(runs: list[dict[str, Any]], algorithm: str) -> np.ndarray:
+    """Cost, return and success of each seed of an algorithm."""
+    figures = ("cost/collision", "return", "success")
+    return np.array(
+        [
+            [run["evaluation"][name][0] for name in figures]
+            for run in runs
+            if run["algorithm"] == algorithm
+        ]
+    )
 
 
 def main(config: Config) -> None:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from time import strftime
-from typing import Literal
+from typing import Any, Literal
+
+import tyro
+
+from experiments.options import short_help
+from torchrl_safe.envs import SUITE, PickAndPlace, Push, Reach
 
 Action = Literal["cartesian", "joint"]
 Observation = Literal["full", "paper"]
@@ -32,6 +39,19 @@ AlgorithmName = Literal[
     "td3-lagrangian",
 ]
 Engine = Literal["bullet", "mujoco"]
+SuiteTaskName = Literal[
+    "panda-reach-in-front",
+    "panda-reach-scattered",
+    "ur5-reach-moving",
+    "panda-reach-human",
+    "iiwa-reach-joints",
+    "xarm6-push-in-front",
+    "panda-push-human",
+    "panda-pick-in-front",
+    "ur10-pick-workspace",
+    "xarm7-pick-scattered",
+]
+CostName = Literal["collision", "contact-force", "joint-limit", "proximity", "separation", "speed"]
 MultiplierRule = Literal["pid", "dual-ascent", "fixed"]
 #: The algorithms that learn from replay; they need bounded actions.
 OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
@@ -55,6 +75,9 @@ class Config:
     """Engine that simulates the arm; mujoco is several times as fast, and needs that extra."""
     paper: bool = False
     """Train in the paper's environment: its Panda, obstacle and actions, at 240 Hz."""
+    suite_task: SuiteTaskName | None = None
+    """Train in a task of the suite: its arm, obstacles, actions, costs and their limits, with the
+    settings that all tasks of its kind have."""
     algorithms: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
     """What to train; ppo is PPO-Lagrangian with its multiplier fixed at 0, and ppo-shield the same
     with a filter of its actions that keeps the arm off the obstacles while it learns."""
@@ -62,8 +85,14 @@ class Config:
     """Train ppo-shield as well, and draw the collisions summed over all of training."""
     cost_limit: float = 0.5
     """Limit of the expected cost of an episode: control steps in which the arm collides."""
+    costs: dict[CostName, float] = dataclasses.field(default_factory=dict)
+    """Several costs instead, each with its limit: --costs collision 0.5 speed 2. The speed is that
+    of the tool above 1 m/s; the others are as the library has them by default."""
     frames: int = 128_000
     """Control steps to train for, with each algorithm."""
+    demonstrations: int = 0
+    """Control steps before the training in which a scripted pilot says what to do, and the policy
+    learns to do it."""
     envs: int = 32
     """Simulated worlds, shared among the workers."""
     workers: int | None = None
@@ -136,12 +165,25 @@ class Config:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
         if not 0 < self.gamma < 1:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
+        if self.demonstrations < 0:
+            raise ValueError(f"demonstrations must not be negative, got {self.demonstrations}.")
+        if self.demonstrations and self.action == "joint":
+            raise ValueError(
+                f"demonstrations must be 0 with joint actions, got {self.demonstrations}: pilots "
+                "say where the tool is to go."
+            )
         if not self.algorithms:
             raise ValueError("algorithms must name at least one algorithm, got none.")
-        for name in ("arm", "task", "obstacles", "physics"):
-            value, own = getattr(self, name), getattr(Config, name)
-            if self.paper and value != own:
-                raise ValueError(f"{name} must be {own} with paper, got {value}.")
+        for cost, limit in self.costs.items():
+            if not 0 <= limit < math.inf:
+                raise ValueError(f"costs must have limits of at least 0, got {limit} for {cost}.")
+        self._refuse("paper", self.paper, "arm", "task", "obstacles", "physics", "costs")
+        self._refuse(
+            "suite_task",
+            self.suite_task is not None,
+            *("arm", "task", "obstacles", "action", "observation", "paper", "costs", "cost_limit"),
+        )
+        self._refuse("costs", bool(self.costs), "cost_limit")
         if self.paper and "ppo-shield" in self.chosen:
             raise ValueError("shield must be False with paper, whose environment has none.")
         for name in self.algorithms:
@@ -149,8 +191,19 @@ class Config:
                 raise ValueError(
                     f"algorithms must not contain {name} with paper: it needs bounded actions."
                 )
-            if name == "ppo-saute" and not self.cost_limit:
-                raise ValueError("cost_limit must be positive with ppo-saute, got 0.")
+            if name in ("cpo", "pcpo") and len(self.cost_limits) > 1:
+                raise ValueError(
+                    f"algorithms must not contain {name} with several costs, got "
+                    f"{', '.join(self.cost_limits)}: it limits one."
+                )
+            if self.demonstrations and name in OFF_POLICY:
+                raise ValueError(
+                    f"demonstrations must be 0 with {name}, which learns off policy, got "
+                    f"{self.demonstrations}."
+                )
+            if name == "ppo-saute" and not all(self.cost_limits.values()):
+                limits = ", ".join(f"{cost} {limit:g}" for cost, limit in self.cost_limits.items())
+                raise ValueError(f"cost_limit must be positive with ppo-saute, got {limits}.")
         if self.envs % self.processes:
             raise ValueError(
                 f"envs must be a multiple of workers, got {self.envs} and {self.processes}."
@@ -160,6 +213,23 @@ class Config:
                 f"frames_per_batch must be a multiple of envs, got {self.frames_per_batch} and "
                 f"{self.envs}."
             )
+
+    def _refuse(self, option: str, given: bool, *others: str) -> None:
+        """Raises unless each of the others is at its default where an option is given."""
+        defaults = {field.name: field for field in dataclasses.fields(self)}
+        for name in others if given else ():
+            value, field = getattr(self, name), defaults[name]
+            own = field.default if field.default_factory is dataclasses.MISSING else {}
+            if value != own:
+                raise ValueError(f"{name} must be {own} with {option}, got {value}.")
+
+    @property
+    def cost_limits(self) -> dict[str, float]:
+        """The limit of each cost, by its name and in the order of the costs."""
+        if self.suite_task is not None:
+            return dict(SUITE[self.suite_task].cost_limits)
+        chosen = {str(name): limit for name, limit in self.costs.items()}
+        return chosen or {"collision": self.cost_limit}
 
     @property
     def chosen(self) -> tuple[AlgorithmName, ...]:
@@ -180,3 +250,75 @@ class Config:
         if self.jobs is not None:
             return self.jobs
         return 1 if self.physics == "bullet" else os.cpu_count() or 1
+
+
+_HANDLING = {
+    "demonstrations": 98_304,
+    "frames": 196_608,
+    "envs": 64,
+    "frames_per_batch": 4096,
+    "minibatch": 512,
+    "hidden": 128,
+    "learning_rate": 3e-4,
+    "first_log_std": -1.7,
+    "last_log_std": -2.5,
+}
+#: The kinds of task, by the names that options give them.
+TASKS: dict[str, type] = {"reach": Reach, "push": Push, "pick-and-place": PickAndPlace}
+# What differs between reaching, pushing and picking up; within a kind of task nothing does.
+KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: _HANDLING, PickAndPlace: _HANDLING}
+
+
+#: How ``--help`` groups the options.
+GROUPS = {
+    "What to train in": (
+        *("task", "arm", "obstacles", "action", "observation", "physics", "suite_task", "paper"),
+    ),
+    "What to train": ("algorithms", "shield", "cost_limit", "costs", "frames", "seed"),
+    "The run": ("out", "resume", "logger", "checkpoint_every", "eval_episodes"),
+    "Speed": ("envs", "workers", "jobs"),
+    "Learning": (
+        *("frames_per_batch", "epochs", "minibatch", "learning_rate", "gamma", "hidden"),
+        *("first_log_std", "last_log_std", "episode_steps", "demonstrations"),
+    ),
+    "The multiplier": ("multiplier_rule", "multiplier_init", "multiplier_rate", "pessimism"),
+}
+_MORE = (
+    "Values shown are the defaults. --help-all says more about each option, with all choices.\n"
+    'Example: make train ARGS="--physics mujoco --obstacles human --cost-limit 1"'
+)
+
+
+def suite_config(name: SuiteTaskName, **others: Any) -> Config:
+    """Returns what a task of the suite is trained with.
+
+    Args:
+        name: the task.
+        **others: other fields of :class:`Config`.
+
+    Raises:
+        ValueError: if there is no such task, or a field is not usable with it.
+    """
+    if name not in SUITE:
+        raise ValueError(f"suite_task must be one of {', '.join(SUITE)}, got {name!r}.")
+    task = SUITE[name]
+    chosen = {"frames": task.frames, **KINDS[type(task.task)], **others}
+    return Config(**{**chosen, "suite_task": name})
+
+
+def command_line(arguments: Sequence[str] | None = None) -> Config:
+    """Reads the options; what is not given is what the task of the suite has, if one is named."""
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--suite-task", "--suite_task", choices=[*SUITE])
+    first.add_argument("--task", default="reach")
+    first.add_argument("-h", "--help", action="store_true")
+    first.add_argument("--help-all", "--help_all", action="store_true")
+    known, _ = first.parse_known_args(arguments)
+    if known.suite_task is not None:
+        default = suite_config(known.suite_task)
+    else:
+        default = Config(**KINDS[TASKS.get(known.task, Reach)])
+    if known.help:
+        print(f"{Config.__doc__}\n\n{short_help(default, GROUPS)}\n\n{_MORE}")
+        raise SystemExit
+    return tyro.cli(Config, args=["--help"] if known.help_all else arguments, default=default)

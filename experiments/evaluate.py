@@ -1,7 +1,8 @@
 """Plays with a policy that was saved: how good it is, how safe, and what it looks like.
 
 ``python -m experiments.evaluate --policy runs/x/ppo-lagrangian/policy.pt`` plays in the environment
-of its training; ``--env my_module:make_env`` in one of your own.
+of its training, ``--policy panda-reach-in-front`` with a policy that comes with the package, and
+``--env my_module:make_env`` in an environment of your own.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -25,14 +26,19 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from experiments import train
 from experiments.agent import num_costs
 from experiments.config import Config as TrainConfig, Engine
-from experiments.report import figures_table, save_animation
+from experiments.film import save_film
+from experiments.report import figures_table
 from torchrl_safe.envs import ArmEnv
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.metrics import conditional_value_at_risk, violation_rate
 from torchrl_safe.policy import Policy, load_policy
 
-# What of a training run's configuration its environment is made of.
-_ENVIRONMENT = ("arm", "obstacles", "action", "observation", "paper", "cost_limit")
+# What of a training run's configuration its environment is made of; files of before there was a
+# choice lack some of it.
+_ENVIRONMENT = (
+    *("arm", "task", "obstacles", "action", "observation", "paper"),
+    *("cost_limit", "costs", "suite_task", "physics"),
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,8 @@ class Config:
     """Evaluate a policy that was saved on its own."""
 
     policy: Path
-    """File that training has written: runs/.../policy.pt."""
+    """File that training has written, runs/.../policy.pt, or the name of a policy that comes with
+    the package, such as panda-reach-in-front."""
     env: str | None = None
     """An environment of your own, as module:function. Called as function(num_envs=...), it
     returns an ArmEnv, or any environment with reward and cost. Without it, the environment that
@@ -60,7 +67,7 @@ class Config:
     gui: bool = False
     """Show some episodes in a window, in real time. Needs a screen, and physics bullet."""
     video: Path | None = None
-    """Film some episodes of an arm into this file, .gif or .webp, at half speed."""
+    """Film some episodes of an arm into this file, .gif or .webp, in slow motion."""
     shown: int = 4
     """Episodes to show or film."""
     out: Path | None = None
@@ -91,19 +98,15 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
             raise ValueError(
                 f"env must be given for a policy that was trained in {saved.settings['env']}."
             )
-        known = {name: saved.settings[name] for name in _ENVIRONMENT}
-        # Policies of before there was a choice were trained to reach, with Bullet.
-        known["task"] = saved.settings.get("task", "reach")
-        known["physics"] = config.physics or saved.settings.get("physics", "bullet")
-        if config.gui and known["physics"] != "bullet":
+        trained = training_config(saved)
+        if config.physics is not None:
+            trained = replace(trained, physics=config.physics)
+        if config.gui and trained.physics != "bullet":
             raise ValueError(
-                f"gui needs physics=bullet, got {known['physics']!r}, which has no window here: "
+                f"gui needs physics=bullet, got {trained.physics!r}, which has no window here: "
                 "make a video instead."
             )
-        algorithm = saved.settings["name"]
-        return partial(
-            train.make_env, TrainConfig(**known, algorithms=(algorithm,)), algorithm=algorithm
-        )
+        return partial(train.make_env, trained, algorithm=saved.settings["name"])
     module, _, function = config.env.partition(":")
     if not function:
         raise ValueError(f"env must be module:function, got {config.env!r}.")
@@ -111,11 +114,19 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
     return getattr(importlib.import_module(module), function)
 
 
+def training_config(saved: Policy) -> TrainConfig:
+    """What of its training's settings the environment is made of."""
+    known = {name: saved.settings[name] for name in _ENVIRONMENT if name in saved.settings}
+    return TrainConfig(**known, algorithms=(saved.settings["name"],))
+
+
 def cost_limits(config: Config, saved: Policy) -> tuple[float, ...]:
     """The limits that are given, or else those of the training."""
-    if config.cost_limits or "cost_limit" not in saved.settings:
-        return config.cost_limits or tuple(saved.settings.get("cost_limits", ()))
-    return (saved.settings["cost_limit"],)
+    if config.cost_limits:
+        return config.cost_limits
+    if "cost_limit" in saved.settings:  # Of make train.
+        return tuple(training_config(saved).cost_limits.values())
+    return tuple(saved.settings.get("cost_limits", ()))
 
 
 def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
@@ -139,6 +150,11 @@ def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
         raise ValueError(f"video films an ArmEnv, got {str(config.video)!r} with {env}.")
 
 
+def cost_names(env: EnvBase) -> tuple[str, ...]:
+    """Names of the costs; an environment that is no arm has their numbers."""
+    return env.cost_names if is_arm(env) else tuple(map(str, range(num_costs(env))))
+
+
 def is_arm(env: EnvBase) -> bool:
     """Tells whether it is an arm that the environment moves."""
     return isinstance(env.base_env if isinstance(env, TransformedEnv) else env, ArmEnv)
@@ -151,7 +167,7 @@ def play(
     episodes = evaluate(
         env, saved.actor, config.episodes, seed=config.seed, max_steps=config.max_steps
     )
-    names = env.cost_names if is_arm(env) else tuple(map(str, range(num_costs(env))))
+    names = cost_names(env)
     return {**summarize(episodes, names), **safety(episodes, names, limits)}
 
 
@@ -190,10 +206,12 @@ def main(config: Config) -> None:
     env = make_env(num_envs=config.envs)
     try:
         check_fit(env, saved, config)
-        figures = play(env, saved, config, limits)
+        figures, names = play(env, saved, config, limits), cost_names(env)
     finally:
         env.close()
-    text = figures_table({config.policy.parent.name: figures}, limits)
+    text = figures_table(
+        {config.policy.parent.name: figures}, dict(zip(names, limits, strict=True))
+    )
     print(text)
     if config.out is not None:
         config.out.mkdir(parents=True, exist_ok=True)
@@ -202,8 +220,13 @@ def main(config: Config) -> None:
         (config.out / "results.json").write_text(json.dumps(results, indent=1))
     if config.video is not None:
         stage = make_env(num_envs=1)
-        stage.set_seed(config.seed)
-        save_animation(stage, saved.actor, config.video, config.shown)
+        save_film(
+            {saved.settings.get("name", config.policy.parent.name): (stage, saved.actor)},
+            config.video,
+            seed=config.seed,
+            limits=dict(zip(names, limits, strict=True)),
+            episodes=config.shown,
+        )
         stage.close()
     if config.gui:
         stage = make_env(num_envs=1, gui=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -102,11 +102,32 @@ def summed_costs(
     }
 
 
-def score(rows: Sequence[dict[str, float]], limit: float) -> float | None:
-    """Mean return of some batches, if each of their mean costs is within the limit."""
+def progress_text(row: Mapping[str, float], limits: Mapping[str, float]) -> str:
+    """Returns the figures of a batch in a few words, each cost beside its limit.
+
+    Examples:
+        >>> row = {"success": 0.9, "return": -2.0, "cost/collision": 0.734}
+        >>> progress_text(row, {"collision": 0.5})
+        'collision 0.73 (limit 0.5), success 90 %, return -2.00'
+    """
+    words = [
+        f"{name} {row[f'cost/{name}']:.2f} (limit {limit:g})"
+        for name, limit in limits.items()
+        if f"cost/{name}" in row
+    ]
+    if "success" in row:
+        words.append(f"success {row['success']:.0%}".replace("%", " %"))
+    if "return" in row:
+        words.append(f"return {row['return']:.2f}")
+    return ", ".join(words) or "no episode has ended yet"
+
+
+def score(rows: Sequence[dict[str, float]], limits: Mapping[str, float]) -> float | None:
+    """Mean return of some batches, if each of their mean costs is within its limit."""
     ended = [row for row in rows if "return" in row]
-    costs = {name for row in ended for name in row if name.startswith("cost/")}
-    if not ended or any(fmean(row[name] for row in ended) > limit for name in costs):
+    if not ended or any(
+        fmean(row[f"cost/{name}"] for row in ended) > limit for name, limit in limits.items()
+    ):
         return None
     return fmean(row["return"] for row in ended)
 

@@ -9,20 +9,22 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from itertools import cycle, product
+from itertools import cycle, product, zip_longest
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.axes import Axes
 
 from experiments import train
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, MultiplierRule
 from experiments.grid import run_grid, save_results
-from experiments.report import COLOURS
+from experiments.style import GREY, colour, cost_axis, figure_style, limit_line
 
 RULES: tuple[MultiplierRule, ...] = ("dual-ascent", "pid")
+_TITLES = {"dual-ascent": "DualAscent", "pid": "PIDControl"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,29 +101,66 @@ def table(runs: list[dict[str, Any]]) -> str:
 
 
 def plot(runs: list[dict[str, Any]], path: Path) -> None:
-    """Draws return against cost: each seed, the means of fixed multipliers joined."""
-    figure, axis = plt.subplots(figsize=(6.4, 4.4))
+    """Draws return against cost, a panel for each rule: where it ends on the fixed ones' front."""
     found = points(runs)
     fixed = {value: rows for (rule, value), rows in found.items() if rule == "fixed"}
-    middle = np.array([rows.mean(0) for rows in fixed.values()])
-    axis.plot(middle[:, 1], middle[:, 0], "o-", color="grey", label="fixed multiplier")
-    for value, (reward, cost, *_) in zip(fixed, middle, strict=True):
-        axis.annotate(f"{value:g}", (cost, reward), xytext=(5, -12), textcoords="offset points")
-        axis.plot(fixed[value][:, 1], fixed[value][:, 0], ".", color="grey", alpha=0.5)
     limits = sorted({value for rule, value in found if rule != "fixed"})
-    for rule, colour in zip(RULES, COLOURS[1:], strict=False):
-        for limit, marker in zip(limits, cycle("sD^vP*"), strict=False):
-            rows = found[rule, limit]
-            label = f"{rule}, limit {limit:g}"
-            axis.plot(rows[:, 1], rows[:, 0], marker, color=colour, ls="", label=label, alpha=0.7)
-    for limit in limits:
-        axis.axvline(limit, color="black", ls="--", lw=0.8)
-    axis.set(xlabel="evaluated episode cost", ylabel="evaluated return", xscale="symlog")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    rules = [rule for rule in RULES if any(key[0] == rule for key in found)]
+    most = max(rows[:, 1].max() for rows in found.values())
+    with figure_style():
+        figure, grid = plt.subplots(
+            1,
+            max(len(rules), 1),
+            figsize=(4.6 * max(len(rules), 1), 3.6),
+            sharex=True,
+            sharey=True,
+            squeeze=False,
+            layout="constrained",
+        )
+        cost_axis(grid[0, 0], "x", most)
+        grid[0, 0].set(xlim=(-0.03, 1.7 * most), ylabel="return")
+        for axis, rule in zip_longest(grid[0], rules):
+            _draw_front(axis, fixed)
+            axis.set(xlabel="cost of an evaluated episode", title=_TITLES.get(rule, ""))
+            for limit in limits:
+                limit_line(axis, limit, vertical=True, text=f"limit {limit:g}", shade=False)
+            for limit, marker in zip(limits, cycle("osD^v"), strict=False):
+                rows = found.get((rule, limit), np.zeros((0, 4)))
+                axis.plot(
+                    rows[:, 1], rows[:, 0], marker, ms=6, color=colour("ppo-lagrangian"), alpha=0.8
+                )
+                if len(rows):
+                    axis.annotate(
+                        f"told to keep {limit:g}",
+                        (rows[:, 1].mean(), rows[:, 0].min()),
+                        xytext=(0, -16),
+                        textcoords="offset points",
+                        ha="center",
+                        color=colour("ppo-lagrangian"),
+                        fontweight="bold",
+                        fontsize=8,
+                    )
+        figure.savefig(path)
+        plt.close(figure)
+
+
+def _draw_front(axis: Axes, fixed: dict[float, np.ndarray]) -> None:
+    """Means of fixed multipliers, named and joined; bars reach to the lowest and highest seed."""
+    middle = np.array([rows.mean(0) for rows in fixed.values()])
+    axis.plot(middle[:, 1], middle[:, 0], "-", color=GREY, lw=1, zorder=1)
+    for value, rows in fixed.items():
+        reward, cost, *_ = rows.mean(0)
+        axis.plot([rows[:, 1].min(), rows[:, 1].max()], [reward, reward], color=GREY, lw=1)
+        axis.plot([cost, cost], [rows[:, 0].min(), rows[:, 0].max()], color=GREY, lw=1)
+        axis.plot(cost, reward, "o", color=GREY, ms=5, zorder=2)
+        axis.annotate(
+            f"multiplier fixed at {value:g}" if value == max(fixed) else f"{value:g}",
+            (cost, reward),
+            xytext=(5, 5),
+            textcoords="offset points",
+            color=GREY,
+            fontsize=8,
+        )
 
 
 def main(config: Config) -> None:

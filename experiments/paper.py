@@ -26,7 +26,7 @@ from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
 from experiments.grid import run_grid, save_results
-from experiments.report import COLOURS
+from experiments.style import colour, figure_style, label_ends, limit_line
 from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ActionMode, paper_env
 from torchrl_safe.evaluation import evaluate
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
@@ -236,22 +236,60 @@ def table(runs: list[dict[str, Any]]) -> str:
 
 
 def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:
-    """Draws the paper's Figure 2: mean and standard deviation over seeds."""
-    figure, axes = plt.subplots(1, 3, figsize=(13, 3.8))
-    for cell, colour in zip(CELLS, COLOURS, strict=True):
-        for axis, name in zip(axes, ("return", "cost", "success"), strict=True):
-            curves = np.array([_smooth(per_epoch(r, name)) for r in runs if r["cell"] == cell])
-            thousands = np.arange(1, curves.shape[1] + 1)
-            mean, spread = curves.mean(0), curves.std(0)
-            axis.plot(thousands, mean, color=colour, label=cell)
-            axis.fill_between(thousands, mean - spread, mean + spread, color=colour, alpha=0.15)
-            axis.set(xlabel="thousand control steps", ylabel=f"episode {name}")
-            axis.grid(alpha=0.3)
-    axes[1].axhline(cost_limit, color="black", ls="--", label="limit")
-    axes[1].legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    """Draws the paper's Figure 2: mean and standard deviation over seeds.
+
+    A row for each kind of action; success is a share, so its bands end at 0 and 1.
+    """
+    kinds = dict.fromkeys(cell.partition(" ")[0] for cell in CELLS)
+    with figure_style():
+        figure, grid = plt.subplots(
+            len(kinds),
+            3,
+            figsize=(12, 2.7 * len(kinds)),
+            sharex=True,
+            sharey="col",
+            squeeze=False,
+            layout="constrained",
+        )
+        figure.suptitle(
+            "Running means of ten epochs; bands: one standard deviation over seeds.",
+            fontsize=8,
+            x=0.01,
+            ha="left",
+        )
+        for row, kind in zip(grid, kinds, strict=True):
+            for axis, name in zip(row, ("return", "cost", "success"), strict=True):
+                ends = []
+                for cell in (cell for cell in CELLS if cell.startswith(kind)):
+                    algorithm = "ppo-lagrangian" if "cPPO" in cell else "ppo"
+                    curves = np.array(
+                        [_smooth(per_epoch(r, name)) for r in runs if r["cell"] == cell]
+                    )
+                    thousands = np.arange(1, curves.shape[1] + 1)
+                    middle, low, high = band(curves, share=name == "success")
+                    axis.plot(thousands, middle, color=colour(algorithm))
+                    axis.fill_between(
+                        thousands, low, high, color=colour(algorithm), alpha=0.15, lw=0
+                    )
+                    ends.append((thousands[-1], middle[-1], cell[4:], colour(algorithm)))
+                axis.set_title(f"{kind}: episode {name}")
+                if name == "success":
+                    axis.set_ylim(0, 1)
+                figure.canvas.draw()
+                if name == "cost":
+                    limit_line(axis, cost_limit)
+                label_ends(axis, ends)
+        for axis in grid[-1]:
+            axis.set_xlabel("thousand control steps")
+        figure.savefig(path)
+        plt.close(figure)
+
+
+def band(curves: np.ndarray, *, share: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean of curves, and a standard deviation below and above; of a share within 0 and 1."""
+    middle, spread = curves.mean(0), curves.std(0)
+    low, high = middle - spread, middle + spread
+    return (middle, low.clip(0, 1), high.clip(0, 1)) if share else (middle, low, high)
 
 
 def main(config: Config) -> None:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import matplotlib.pyplot as plt
 import torch
+from matplotlib.ticker import EngFormatter
 from PIL import Image
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from experiments.style import colour, cost_axis, figure_style, label, label_ends, limit_line
 from torchrl_safe.metrics import mean
 
 _CURVES = {
@@ -20,16 +21,17 @@ _CURVES = {
     "cost": "episode cost: ",
     "summed": "cost of all training: ",
 }
-COLOURS = ("tab:orange", "tab:blue", "tab:green", "tab:purple")
+# Batches over which curves are averaged.
+_SMOOTH = 5
 
 
 def table(results: dict[str, Any]) -> str:
     """Returns a Markdown table: a row for each algorithm, estimates with 95 % intervals."""
     rows = {name: run["evaluation"] for name, run in results["algorithms"].items()}
-    return figures_table(rows, [results["config"]["cost_limit"]])
+    return figures_table(rows, results["cost_limits"])
 
 
-def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Sequence[float]) -> str:
+def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Mapping[str, float]) -> str:
     """Returns a Markdown table of named rows of figures, each with its interval or without."""
     columns = list(next(iter(rows.values())))
     lines = [
@@ -39,8 +41,12 @@ def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Sequence
     for name, row in rows.items():
         cells = (_cell(*row[column], share=_is_share(column)) for column in columns)
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    limits = ", ".join(f"{limit:g}" for limit in cost_limits)
-    lines.append(f"\nCost limit {limits}; brackets: 95 % confidence.")
+    if len(cost_limits) == 1:
+        (limit,) = cost_limits.values()
+        shown = f"limit {limit:g}"
+    else:
+        shown = "limits " + ", ".join(f"{name} {limit:g}" for name, limit in cost_limits.items())
+    lines.append(f"\nCost {shown}; brackets: 95 % confidence.")
     return "\n".join(lines)
 
 
@@ -68,69 +74,65 @@ def seeds_within(costs: torch.Tensor, limit: float) -> str:
 def plot_curves(results: dict[str, Any], path: Path) -> None:
     """Draws return and cost against frames, and the cost limit: the paper's Figure 2.
 
-    With a shield also the costs summed over all of training.
+    Thin lines are means over the episodes of a batch, thick ones those over five batches. With a
+    shield also the costs summed over all of training.
     """
     runs = results["algorithms"]
     history = next(iter(runs.values()))["history"]
     costs = [key for key in max(history, key=len) if key.startswith("cost/")]
     sums = [f"summed/{key.partition('/')[2]}" for key in costs if "ppo-shield" in runs]
     keys = ["return", *costs, *sums]
-    figure, grid = plt.subplots(1, len(keys), figsize=(5 * len(keys), 3.6), squeeze=False)
-    axes = list(grid[0])
-    for axis, key in zip(axes, keys, strict=True):
-        for index, (name, run) in enumerate(runs.items()):
-            colour = COLOURS[index] if index < len(COLOURS) else plt.get_cmap("tab20")(index)
-            rows = [row for row in run["history"] if key in row]
-            axis.plot([r["frames"] for r in rows], [r[key] for r in rows], color=colour, label=name)
-        kind, _, cost = key.partition("/")
-        axis.set(xlabel="frames", ylabel=_CURVES[kind] + cost)
-        axis.grid(alpha=0.3)
-    for axis in axes[1 : 1 + len(costs)]:
-        axis.axhline(results["config"]["cost_limit"], color="black", ls="--", label="limit")
-    for axis in axes[1 + len(costs) :]:
-        # From none to thousands.
-        axis.set_yscale("symlog", linthresh=10)
-    axes[len(costs)].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    with figure_style():
+        figure, grid = plt.subplots(
+            1, len(keys), figsize=(4.6 * len(keys), 3.2), squeeze=False, layout="constrained"
+        )
+        figure.suptitle(
+            "Thin: mean of the episodes that end in a batch. Thick: five batches. One seed.",
+            fontsize=8,
+            x=0.01,
+            ha="left",
+        )
+        for axis, key in zip(grid[0], keys, strict=True):
+            ends = []
+            for name, run in runs.items():
+                frames, values = zip(
+                    *((row["frames"], row[key]) for row in run["history"] if key in row),
+                    strict=True,
+                )
+                middle = values if key.startswith("summed/") else running_mean(values)
+                axis.plot(frames, values, color=colour(name), lw=0.8, alpha=0.35)
+                axis.plot(frames, middle, color=colour(name), lw=1.8)
+                ends.append((frames[-1], middle[-1], label(name), colour(name)))
+            kind, _, cost = key.partition("/")
+            axis.set(xlabel="control steps", title=_CURVES[kind] + cost)
+            axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+            if kind == "cost":
+                axis.set_ylim(bottom=0)
+                limit_line(axis, results["cost_limits"][cost])
+            elif kind == "summed":
+                # From none to thousands.
+                cost_axis(axis, "y", max(end[1] for end in ends))
+            axis.set_xlim(0, 1.02 * max(end[0] for end in ends))
+            figure.canvas.draw()
+            label_ends(axis, ends)
+        figure.savefig(path)
+        plt.close(figure)
+
+
+def running_mean(values: Sequence[float], width: int = _SMOOTH) -> list[float]:
+    """Returns the mean of each value and those before it, ``width`` in all at most.
+
+    Examples:
+        >>> running_mean([1.0, 3.0, 5.0], width=2)
+        [1.0, 2.0, 4.0]
+    """
+    return [fmean(values[max(0, end - width) : end]) for end in range(1, len(values) + 1)]
 
 
 def save_picture(env: EnvBase, path: Path) -> None:
     """Saves a picture of the first world at the start of an episode."""
     env.reset()
     Image.fromarray(env.render(width=640, height=480)[0].numpy()).save(path)
-
-
-@torch.no_grad()
-def save_animation(
-    env: EnvBase,
-    policy: Callable[[TensorDictBase], TensorDictBase],
-    path: Path,
-    episodes: int = 2,
-) -> None:
-    """Saves a GIF of the deterministic policy, at half speed."""
-    frames: list[Image.Image] = []
-    # GIF counts in hundredths of a second, and viewers take their time for very few of them.
-    every = max(1, round(env.control_rate / 20))
-    steps = 0
-
-    def shoot() -> None:
-        frames.append(Image.fromarray(env.render(width=320, height=240)[0].numpy()))
-
-    def film(*_: Any) -> None:
-        nonlocal steps
-        if steps % every == 0:
-            shoot()
-        steps += 1
-
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(episodes):
-            env.rollout(env.max_episode_steps, policy, callback=film)
-            shoot()  # Of the last step TorchRL says nothing.
-    path.parent.mkdir(parents=True, exist_ok=True)
-    milliseconds = round(2000 * every / env.control_rate)
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
 
 
 def _is_share(column: str) -> bool:

@@ -14,17 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import numpy as np
 import torch
 import tyro
 
 from experiments import train
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, Observation
 from experiments.grid import run_grid, save_results
-from experiments.report import COLOURS, episode_costs, mean_over_seeds, seeds_within, successes
+from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
+from experiments.style import ALARM, INK, colour, cost_axis, figure_style, label, label_ends
 from torchrl_safe.metrics import mean, worst_seed
-
-# Where a cost of 0 is drawn on a logarithmic axis.
-_LEAST = 1e-2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,34 +111,62 @@ def table(runs: list[dict[str, Any]], config: Config) -> str:
 
 def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
     """Draws the cost of each seed, with its 95 % interval, against the limit."""
-    columns = len(config.actions)
-    figure, axes = plt.subplots(1, columns, figsize=(5.4 * columns, 4.2), squeeze=False)
-    for axis, action in zip(axes[0], config.actions, strict=True):
-        ends = [min(config.limits) / 1.5, max(config.limits) * 1.5]
-        axis.plot(ends, ends, color="black", ls="--", label="limit")
-        axis.fill_between(ends, ends, 100, color="black", alpha=0.06)
-        for seed in range(config.seeds):
-            for limit in config.limits:
+    columns, hue = len(config.actions), colour("ppo-lagrangian")
+    least, most = min(config.limits) / 1.5, max(config.limits) * 1.5
+    highest = max(run["evaluation"]["cost/collision"][2] for run in runs)
+    with figure_style():
+        figure, axes = plt.subplots(
+            1,
+            columns,
+            figsize=(4.6 * columns, 3.6),
+            squeeze=False,
+            sharey=True,
+            layout="constrained",
+        )
+        for axis, action in zip(axes[0], config.actions, strict=True):
+            axis.set_xscale("log")
+            cost_axis(axis, "y", max(most, highest))
+            axis.set(xlim=(least, most), ylim=(-0.02, 1.3 * max(most, highest)))
+            axis.set_xticks(config.limits, [f"{limit:g}" for limit in config.limits])
+            axis.minorticks_off()
+            # A straight line would not be one on these axes.
+            limits = np.geomspace(least, most, 50)
+            axis.plot(limits, limits, color=INK, lw=1, ls=(0, (4, 3)))
+            axis.fill_between(limits, limits, axis.get_ylim()[1], color=ALARM, alpha=0.05, lw=0)
+            axis.annotate(
+                "above the limit",
+                (least, axis.get_ylim()[1]),
+                xytext=(4, -4),
+                va="top",
+                textcoords="offset points",
+                color=ALARM,
+                fontsize=8,
+            )
+            for seed, limit in product(range(config.seeds), config.limits):
                 (mine,) = (r for r in _select(runs, action, limit) if r["seed"] == seed)
-                value, low, high = (max(x, _LEAST) for x in mine["evaluation"]["cost/collision"])
+                value, low, high = mine["evaluation"]["cost/collision"]
                 # Beside each other, not on top of each other.
                 x = limit * 1.06 ** (seed - (config.seeds - 1) / 2)
-                axis.plot([x, x], [low, high], color=COLOURS[1], alpha=0.5)
-                label = (
-                    "PPO-Lagrangian, one seed" if (seed, limit) == (0, config.limits[0]) else None
-                )
-                axis.plot(x, value, "o", color=COLOURS[1], ms=4, label=label)
-        ppo = mean(episode_costs(_select(runs, action, None)).flatten().unsqueeze(-1))
-        axis.axhline(ppo.value.item(), color=COLOURS[0], label="PPO")
-        axis.set(
-            xscale="log", yscale="log", xlim=ends, ylim=(_LEAST / 1.3, 40), title=action,
-            xlabel="cost limit", ylabel="evaluated episode cost",
-        )  # fmt: skip
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8, loc="upper left")
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+                axis.plot([x, x], [low, high], color=hue, alpha=0.5)
+                axis.plot(x, value, "o", color=hue, ms=4)
+            ppo = mean(episode_costs(_select(runs, action, None)).flatten().unsqueeze(-1))
+            axis.axhline(ppo.value.item(), color=colour("ppo"), lw=1.5)
+            axis.axhspan(ppo.low.item(), ppo.high.item(), color=colour("ppo"), alpha=0.15, lw=0)
+            axis.set(title=f"{action} actions", xlabel="cost limit")
+            figure.canvas.draw()
+            nearest = _select(runs, action, max(config.limits))
+            middle = sum(r["evaluation"]["cost/collision"][0] for r in nearest) / len(nearest)
+            label_ends(
+                axis,
+                [
+                    (most, ppo.value.item(), label("ppo"), colour("ppo")),
+                    (most, middle, label("ppo-lagrangian"), hue),
+                    (most, most, "limit", INK),
+                ],
+            )
+        axes[0, 0].set_ylabel("cost of an evaluated episode")
+        figure.savefig(path)
+        plt.close(figure)
 
 
 def main(config: Config) -> None:

@@ -13,10 +13,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
@@ -25,46 +25,55 @@ from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, Training
-from experiments.config import AlgorithmName, Config
+from experiments.config import AlgorithmName, Config, command_line
+from experiments.demonstrations import start_from_demonstrations
 from experiments.files import is_new, write_whole
+from experiments.film import save_film
 from experiments.grid import side_by_side
-from experiments.log import Log, figures, score, summed_costs, versions
-from experiments.report import plot_curves, save_animation, save_picture, table
+from experiments.log import Log, figures, progress_text, score, summed_costs, versions
+from experiments.report import plot_curves, save_picture, table
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
 from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import (
     PAPER_CARTESIAN,
     PAPER_JOINT,
+    SUITE,
     ActionMode,
     ArmEnv,
     Bullet,
     CartesianDelta,
     Collision,
+    ContactForce,
     FullObservation,
     Human,
     InFront,
     JointDelta,
+    JointLimit,
     Moving,
     MuJoCo,
     NoObstacles,
     Obstacles,
     Physics,
     PickAndPlace,
+    Proximity,
     Push,
     Reach,
     Scattered,
+    Speed,
+    SpeedAndSeparation,
     Task,
     gym,
     paper_env,
     paper_observation,
 )
+from torchrl_safe.envs.arm_env import Cost
 from torchrl_safe.evaluation import evaluate, summarize
-from torchrl_safe.policy import save_policy
+from torchrl_safe.policy import load_policy, save_policy
 
 # The tasks, with control steps enough for an episode.
 TASKS: dict[str, tuple[Task, int]] = {
     "reach": (Reach(), 40),
-    "push": (Push(), 100),
+    "push": (Push(), 200),
     "pick-and-place": (PickAndPlace(), 100),
 }
 ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
@@ -78,7 +87,15 @@ OBSTACLES: dict[str, Obstacles] = {
 PHYSICS: dict[str, Physics] = {"bullet": Bullet(), "mujoco": MuJoCo()}
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
 OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
-COSTS = {"collision": Collision()}
+COSTS: dict[str, Cost] = {
+    "collision": Collision(),
+    "contact-force": ContactForce(),
+    "joint-limit": JointLimit(),
+    "proximity": Proximity(),
+    "separation": SpeedAndSeparation(),
+    # Actions ask for up to 1 m/s along each axis.
+    "speed": Speed(limit=1.0),
+}
 # What may be another when a run is resumed: it changes nothing in what is learnt.
 CHANGEABLE = ("algorithms", "shield", "jobs", "out", "logger", "resume", "checkpoint_every")
 
@@ -97,7 +114,6 @@ def make_env(
     The sums, over each episode, are of what the arm has earned and cost, whatever an algorithm
     makes of it.
     """
-    task, steps = TASKS[config.task]
     settings: dict[str, Any] = {
         "observation": OBSERVATIONS[config.observation],
         "num_envs": num_envs,
@@ -110,14 +126,9 @@ def make_env(
         env = paper_env(PAPER_ACTIONS[config.action], **settings)
     else:
         env = ArmEnv(
-            ARMS[config.arm],
-            action=make_action(config),
-            task=task,
-            obstacles=OBSTACLES[config.obstacles],
-            costs=COSTS,
             physics=PHYSICS[config.physics],
             shield=ALGORITHMS[algorithm].shield,
-            **{"max_episode_steps": steps, **settings},
+            **{**arm_arguments(config), **settings},
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = ALGORITHMS[algorithm].transforms(config)
@@ -126,13 +137,31 @@ def make_env(
     return TransformedEnv(env, Compose(sums, *transforms))
 
 
+def arm_arguments(config: Config) -> dict[str, Any]:
+    """What the arm, its task and its costs are, as arguments of ArmEnv."""
+    if config.suite_task is not None:
+        return SUITE[config.suite_task].arguments
+    task, steps = TASKS[config.task]
+    return {
+        "arm": ARMS[config.arm],
+        "action": make_action(config),
+        "task": task,
+        "obstacles": OBSTACLES[config.obstacles],
+        "costs": {name: COSTS[name] for name in config.cost_limits},
+        "max_episode_steps": steps,
+    }
+
+
 def make_action(config: Config) -> ActionMode:
     """Makes what an action does, as the task needs it."""
+    if config.task == "reach":
+        return JointDelta() if config.action == "joint" else CartesianDelta()
     fingers = 0.04 if config.task == "pick-and-place" else None
     if config.action == "joint":
         return JointDelta(finger_step=fingers)
     # As fast as an arm may reach, 1 m/s, a cube that is hit slides on for 0.2 m.
-    return CartesianDelta(step=0.05 if config.task == "reach" else 0.03, finger_step=fingers)
+    held = ARMS[config.arm].handling_orientation
+    return CartesianDelta(step=0.03, orientation=held, finger_step=fingers)
 
 
 @contextmanager
@@ -187,13 +216,14 @@ def train(
     env.close()
     log = Log(config.logger, config.out / "logs", algorithm)
     batches = math.ceil(config.frames / config.frames_per_batch)
+    costs = tuple(config.cost_limits)
     with (
         collecting(config, training.collector, algorithm) as collector,
         tqdm(
             total=config.frames,
             desc=algorithm,
-            unit="frame",
-            unit_scale=True,
+            # Rates and counts would push off the line what one wants to know.
+            bar_format="{desc} {percentage:3.0f} % |{bar:20}| {remaining} left{postfix}",
             disable=not progress,
             position=line,
         ) as bar,
@@ -209,10 +239,11 @@ def train(
             },
             settings={"algorithm": algorithm, **settings(dataclasses.asdict(config))},
         )
-        if config.resume:
-            checkpoints.load()
-        else:
+        if not config.resume:
             checkpoints.clear()
+        if checkpoints.load() is None and config.demonstrations:
+            demonstrate(config, algorithm, training)
+            collector.update_policy_weights_()
         log.open()
         bar.update(log.frames)
         for batch in islice(collector, batches - len(log.rows)):
@@ -222,15 +253,23 @@ def train(
             training.learner.learn(batch)
             collector.update_policy_weights_()
             bar.update(batch.numel())
-            row = figures(episodes, training.loss, tuple(COSTS))
-            row |= summed_costs(batch, log.rows, tuple(COSTS))
-            bar.set_postfix({name: f"{value:.2f}" for name, value in row.items()})
+            row = figures(episodes, training.loss, costs)
+            row |= summed_costs(batch, log.rows, costs)
+            bar.set_postfix_str(progress_text(row, config.cost_limits))
             log.add({"frames": log.frames + batch.numel(), **row})
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
                 recent = log.rows[-config.checkpoint_every :]
-                checkpoints.save(log.frames, score=score(recent, config.cost_limit))
+                checkpoints.save(log.frames, score=score(recent, config.cost_limits))
     keep_policy(config, algorithm, training)
     return training.actor, log
+
+
+def demonstrate(config: Config, algorithm: AlgorithmName, training: Training) -> None:
+    """Starts policy and critics from demonstrations, in episodes that nothing else uses."""
+    seed = config.seed + 2_000_000
+    env = make_env(config, config.envs, seed, algorithm, training=True)
+    start_from_demonstrations(training, env, config)
+    env.close()
 
 
 def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) -> None:
@@ -258,7 +297,7 @@ def train_and_evaluate(
         "versions": versions(),
         "seconds": seconds,
         "history": log.rows,
-        "evaluation": summarize(episodes, tuple(COSTS)),
+        "evaluation": summarize(episodes, tuple(config.cost_limits)),
         "episodes": {name: value.tolist() for name, value in episodes.items()},
     }
 
@@ -271,7 +310,11 @@ def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
 def start(config: Config) -> dict[str, Any]:
     """Begins a run, or reads what one that is resumed has finished."""
     path = config.out / "results.json"
-    results: dict[str, Any] = {"config": dataclasses.asdict(config), "algorithms": {}}
+    results: dict[str, Any] = {
+        "config": dataclasses.asdict(config),
+        "cost_limits": config.cost_limits,
+        "algorithms": {},
+    }
     if config.resume and path.exists():
         before = json.loads(path.read_text())
         refuse_other_settings(settings(before["config"]), settings(results["config"]))
@@ -286,13 +329,25 @@ def start(config: Config) -> dict[str, Any]:
     return results
 
 
-def train_and_film(config: Config, algorithm: AlgorithmName, line: int = 0) -> dict[str, Any]:
-    """Trains, evaluates and films one algorithm; returns its results."""
-    actor, result = train_and_evaluate(config, algorithm, line=line)
-    stage = make_env(config, num_envs=1, seed=config.seed, algorithm=algorithm)
-    save_animation(stage, actor, config.out / algorithm / "policy.gif")
-    stage.close()
-    return result
+def result_of(config: Config, algorithm: AlgorithmName, line: int = 0) -> dict[str, Any]:
+    """Trains and evaluates one algorithm; returns its results, which fit into a pipe."""
+    return train_and_evaluate(config, algorithm, line=line)[1]
+
+
+def film(config: Config, path: Path, *, seed: int, **options: Any) -> None:
+    """Films the policies of a run side by side; ``options`` are those of :func:`save_film`."""
+    actors = {
+        name: (
+            make_env(config, num_envs=1, algorithm=name),
+            load_policy(config.out / name / "policy.pt").actor,
+        )
+        for name in config.chosen
+    }
+    try:
+        save_film(actors, path, seed=seed, limits=config.cost_limits, **options)
+    finally:
+        for env, _ in actors.values():
+            env.close()
 
 
 def finish(
@@ -302,10 +357,10 @@ def finish(
     workers = min(config.side_by_side, len(algorithms))
     if workers < 2:
         for algorithm in algorithms:
-            yield algorithm, train_and_film(config, algorithm)
+            yield algorithm, result_of(config, algorithm)
         return
     jobs = [(config, algorithm, line) for line, algorithm in enumerate(algorithms)]
-    for index, result in side_by_side(train_and_film, jobs, workers=workers):
+    for index, result in side_by_side(result_of, jobs, workers=workers):
         yield algorithms[index], result
 
 
@@ -322,10 +377,11 @@ def main(config: Config) -> None:
     save_picture(stage, config.out / "scene.png")
     stage.close()
     plot_curves(results, config.out / "curves.png")
+    film(config, config.out / "film.gif", seed=config.seed, width=320)
     text = table(results)
     (config.out / "table.md").write_text(text)
     print(f"\n{text}\nResults are in {config.out}.")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(command_line())

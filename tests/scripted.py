@@ -4,8 +4,6 @@ A pilot is a generator for one world: it looks at the environment's state, and y
 tool is to go next, m, and how far the fingers are to open (1) or close (0).
 """
 
-import math
-
 import numpy as np
 import torch
 from tensordict import TensorDict
@@ -43,16 +41,6 @@ FOREARM = {
     UR5: [(-0.1, -0.12, 0.15, 0.08), (-0.18, -0.15, 0.2, 0.08)],
     UR10: [(-0.1, -0.12, 0.15, 0.09), (-0.18, -0.15, 0.2, 0.09)],
 }
-
-# Orientations of the tool that keep the arm off an obstacle beside the object. Turned by a
-# quarter, the hand shows it its narrow side; to which side, decides where the elbow of an arm
-# with seven joints goes. The wrist of a UR hangs too low for that: leaning, it stays back.
-LEFT, RIGHT = (
-    (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
-    (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),
-)
-LEANING = (0.0, math.cos(0.3), 0.0, math.sin(0.3))
-HOLD = {PANDA: RIGHT, IIWA: RIGHT, XARM6: RIGHT, XARM7: LEFT, UR5: LEANING, UR10: LEANING}
 
 
 def fly(env, pilot, steps=None, share=CALM):

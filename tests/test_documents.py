@@ -1,4 +1,4 @@
-"""What the documents show runs: README and the pages of the site. `make docs` runs the tutorials."""
+"""What README and the pages of the site show runs. `make docs` runs the tutorials."""
 
 import math
 import re

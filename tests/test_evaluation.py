@@ -161,7 +161,7 @@ def test_table_of_hand_made_results():
     """Shares in percent, means as they are; each under its own heading."""
     row = {"success": [0.5, 0.25, 0.75], "cost/hit": [2, 1, 3], "any/hit": [0.125, 0.0, 0.25]}
     results = {
-        "config": {"cost_limit": 0.5},
+        "cost_limits": {"hit": 0.5},
         "algorithms": {
             "ppo": {"evaluation": row},
             "other": {"evaluation": {**row, "cost/hit": [0.5, 0.25, 0.75]}},

@@ -10,7 +10,6 @@ import pybullet
 import pytest
 from bullet_worlds import worlds_of
 from scripted import (
-    HOLD,
     carry,
     carry_low,
     distance,
@@ -58,12 +57,12 @@ def settings(arm, task):
         "reach": {"task": Reach(), "max_episode_steps": 40},
         "push": {
             "task": Push(),
-            "action": CartesianDelta(orientation=HOLD[arm]),
+            "action": CartesianDelta(orientation=arm.handling_orientation),
             "max_episode_steps": 300,
         },
         "pick": {
             "task": PickAndPlace(),
-            "action": CartesianDelta(orientation=HOLD[arm], finger_step=0.04),
+            "action": CartesianDelta(orientation=arm.handling_orientation, finger_step=0.04),
             "max_episode_steps": 120,
         },
     }[task]

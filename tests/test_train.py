@@ -1,10 +1,10 @@
 """The main job, made small: what it leaves behind, and what it refuses."""
 
 import contextlib
+import dataclasses
 import io
 import json
 import math
-from functools import partial
 from typing import get_args
 
 import pytest
@@ -17,10 +17,11 @@ from torchrl.checkpoint import Checkpoint
 import experiments.train
 from experiments.agent import make_agent
 from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES, OffPolicy
-from experiments.config import OFF_POLICY, AlgorithmName, Config
+from experiments.config import OFF_POLICY, AlgorithmName, Config, command_line
+from experiments.film import save_film
 from experiments.learners import NoiseSchedule
 from experiments.log import summed_costs
-from experiments.report import plot_curves, save_animation, table
+from experiments.report import plot_curves, table
 from experiments.train import collecting, main, make_env, train
 from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
@@ -34,6 +35,10 @@ def make_training(algorithm="ppo-lagrangian", **settings):
     training = ALGORITHMS[algorithm].build(env, Config(**settings))
     env.close()
     return training
+
+
+def tiny_film(*args, **settings):
+    save_film(*args, **{**settings, "episodes": 1, "width": 32})
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +57,7 @@ def finished(tmp_path_factory):
     )
     printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
-        patch.setattr(experiments.train, "save_animation", partial(save_animation, episodes=1))
+        patch.setattr(experiments.train, "save_film", tiny_film)
         main(config)
     return config.out, printed.getvalue()
 
@@ -65,9 +70,10 @@ def test_what_it_leaves(finished):
         assert [row["frames"] for row in run["history"]] == [512, 1024]
         for estimate, low, high in run["evaluation"].values():
             assert low <= estimate <= high
-        with Image.open(out / name / "policy.gif") as film:
-            assert film.n_frames > 10
         assert list((out / "logs").rglob(f"*{name}*"))
+    with Image.open(out / "film.gif") as film:
+        assert film.n_frames > 10
+        assert film.width > 2 * 32, "PPO and PPO-Lagrangian, side by side"
     for picture in ("curves.png", "scene.png"):
         with Image.open(out / picture) as image:
             assert image.width >= 640
@@ -120,6 +126,24 @@ def test_help_names_the_options(capsys):
         assert f"--{option}" in shown
 
 
+def test_help_is_short_and_grouped(capsys):
+    """A line for each option, in one of the groups; --help-all says all."""
+    for more in ([], ["--suite-task", "ur5-reach-moving"]):
+        with pytest.raises(SystemExit) as end:
+            command_line([*more, "--help"])
+        assert not end.value.code
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines)) <= 100
+        assert len(lines) < 60
+        shown = [line.split()[0] for line in lines if line.startswith("  --")]
+        names = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Config)]
+        assert sorted(shown) == sorted(names)
+        assert all(len(line.split("  ", 2)[-1].split()) > 1 for line in lines if "--" in line)
+    with pytest.raises(SystemExit, match="0"):
+        command_line(["--help-all"])
+    assert "ppo-shield the same" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_shield_is_trained_with_beside_the_others():
     algorithms = ("ppo", "ppo-lagrangian")
     assert Config().chosen == algorithms
@@ -143,11 +167,11 @@ def test_curves_with_a_shield_show_the_sum(tmp_path):
     widths = []
     for name in ("ppo", "ppo-shield"):
         row = {"frames": 8, "return": -1.0, "cost/collision": 1.0, "summed/collision": 3.0}
-        results = {"config": {"cost_limit": 0.5}, "algorithms": {name: {"history": [row]}}}
+        results = {"cost_limits": {"collision": 0.5}, "algorithms": {name: {"history": [row]}}}
         plot_curves(results, tmp_path / "curves.png")
         with Image.open(tmp_path / "curves.png") as image:
             widths.append(image.width)
-    assert widths == [1200, 1800]
+    assert widths[1] == pytest.approx(1.5 * widths[0], abs=1)
 
 
 def test_multiplier_rules():
@@ -315,10 +339,22 @@ def test_noise_falls_from_batch_to_batch():
         ({"minibatch": 0}, "minibatch must be at least 1, got 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be positive, got nan"),
         ({"cost_limit": -1.0}, "cost_limit must not be negative, got -1.0"),
+        ({"demonstrations": -1}, "demonstrations must not be negative, got -1"),
+        (
+            {"demonstrations": 1, "algorithms": ("sac-lagrangian",)},
+            "demonstrations must be 0 with sac-lagrangian, which learns off policy, got 1",
+        ),
+        (
+            {"demonstrations": 1, "action": "joint"},
+            "demonstrations must be 0 with joint actions, got 1",
+        ),
         ({"algorithms": ()}, "algorithms must name at least one"),
         ({"algorithms": ("cpo", "td3-lagrangian"), "paper": True}, "not contain td3-lagrangian"),
         ({"algorithms": ("ppo-saute",), "cost_limit": 0.0}, "cost_limit must be positive with ppo"),
         ({"shield": True, "paper": True}, "shield must be False with paper"),
+        ({"costs": {"speed": -1.0}}, "costs must have limits of at least 0, got -1.0 for speed"),
+        ({"costs": {"speed": 1.0}, "cost_limit": 2.0}, "cost_limit must be 0.5 with costs, got 2"),
+        ({"costs": {"speed": 1.0}, "paper": True}, "costs must be {} with paper, got {'speed': 1"),
     ],
 )
 def test_bad_settings(settings, message):
@@ -330,7 +366,7 @@ def test_bad_settings(settings, message):
     ("task", "kind", "step", "fingers", "steps"),
     [
         ("reach", Reach, 0.05, 0, 40),
-        ("push", Push, 0.03, 0, 100),
+        ("push", Push, 0.03, 0, 200),
         ("pick-and-place", PickAndPlace, 0.03, 1, 100),
     ],
 )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import io
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -25,10 +26,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_safe._files import writing
 from torchrl_safe._program import Program, record
 
-__all__ = ["Policy", "load_policy", "save_policy"]
+__all__ = ["Policy", "load_policy", "save_policy", "shipped_policies"]
 
 #: What a file of ours says it is; the number rises when its contents change.
 _FORMAT, _VERSION = "torchrl-safe policy", 2
+# The policies that come with the package, each with a card beside it that says how good it is.
+_SHIPPED = Path(__file__).parent / "policies"
 # Where the actor's weights are in what is recorded.
 _ACTOR = "actor."
 
@@ -232,10 +235,12 @@ def load_policy(path: str | Path) -> Policy:
     made of PyTorch's Core ATen operators. The policy runs on the CPU.
 
     Args:
-        path (str or Path): the file.
+        path (str or Path): the file, or the name of a policy that comes with the package: a task of
+            the :data:`~torchrl_safe.envs.SUITE`, such as ``"panda-reach-in-front"``. A file of that
+            name comes first.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if there is neither such a file nor such a policy.
         ValueError: if it is another kind of file, torn, tampered with, or of another version.
 
     Examples:
@@ -247,8 +252,26 @@ def load_policy(path: str | Path) -> Policy:
 
         See :func:`save_policy` for an example that runs.
     """
-    with Path(path).open("rb") as file:
+    chosen, shipped = Path(path), shipped_policies()
+    if not chosen.is_file():
+        if str(path) not in shipped:
+            raise FileNotFoundError(
+                f"path must be a file or one of {', '.join(shipped)}, got {str(path)!r}."
+            )
+        chosen = _SHIPPED / f"{path}.pt"
+    with chosen.open("rb") as file:
         return _read(file, f"path must be a file that save_policy wrote, got {str(path)!r}")
+
+
+def shipped_policies() -> dict[str, dict[str, Any]]:
+    """Returns the cards of the policies that come with the package, by their names.
+
+    A card has the ``task``, its ``cost_limits``, what episodes of the deterministic policy have
+    shown (``success``, ``return``, and each cost; estimates with the ends of their 95 % confidence
+    intervals), and how it was ``trained``.
+    """
+    files = sorted(_SHIPPED.glob("*.json"))
+    return {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files}
 
 
 def _read(file: IO[bytes], wanted: str) -> Policy:

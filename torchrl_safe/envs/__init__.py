@@ -36,10 +36,12 @@ from torchrl_safe.envs.obstacles import (
     Cylinder,
     Human,
     InFront,
+    Look,
     Motion,
     Moving,
     NoObstacles,
     Obstacles,
+    Part,
     Patrol,
     Placement,
     Scattered,
@@ -55,6 +57,7 @@ from torchrl_safe.envs.physics.simulator import Nearest, Physics, Simulator
 from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.shield import Shield
 from torchrl_safe.envs.state import ArmState, Sensing, Sensor
+from torchrl_safe.envs.suite import SUITE, SuiteTask
 from torchrl_safe.envs.tasks import PickAndPlace, Push, Reach, Task
 from torchrl_safe.envs.transforms import CostToReward, EarlyTermination, FrameSkip, Saute
 
@@ -65,6 +68,7 @@ __all__ = [
     "PAPER_JOINT",
     "PAPER_SETTINGS",
     "PARALLEL_GRIPPER",
+    "SUITE",
     "UR5",
     "UR10",
     "XARM6",
@@ -93,6 +97,7 @@ __all__ = [
     "InverseKinematics",
     "JointDelta",
     "JointLimit",
+    "Look",
     "Motion",
     "Moving",
     "MuJoCo",
@@ -100,6 +105,7 @@ __all__ = [
     "NoObstacles",
     "NoRoomError",
     "Obstacles",
+    "Part",
     "Patrol",
     "Physics",
     "PickAndPlace",
@@ -120,6 +126,7 @@ __all__ = [
     "Speed",
     "SpeedAndSeparation",
     "Sphere",
+    "SuiteTask",
     "Swing",
     "Task",
     "Workspace",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from torchrl_safe._checks import check_array, check_kind
@@ -57,6 +58,9 @@ class ArmModel:
         finger_home: position of the joints that are not part of the arm, in metres, where they
             are free.
         gripper: what is mounted on ``ee_link``; its ``tool_link`` then is the tool point.
+        handling_orientation: tool orientation, a quaternion (x, y, z, w), that keeps the arm off
+            an obstacle beside the object that it pushes or picks up: give it to
+            :class:`~torchrl_safe.envs.CartesianDelta`. ``None`` is that of the home pose.
 
     Raises:
         TypeError: if ``goals`` or ``gripper`` is not of its kind. A file, link or home pose that
@@ -74,12 +78,25 @@ class ArmModel:
     goals: Region = Region((0.6, -0.2, 0.05), (0.7, 0.2, 0.15))
     finger_home: float = 0.0
     gripper: Gripper | None = None
+    handling_orientation: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
         check_kind("goals", self.goals, Region)
         check_array("finger_home", self.finger_home, ())
         if self.gripper is not None:
             check_kind("gripper", self.gripper, Gripper)
+        if self.handling_orientation is not None:
+            check_array("handling_orientation", self.handling_orientation, (4,))
+
+
+# Turned by a quarter, a hand shows its narrow side to what is beside the object; to which side,
+# decides where the elbow of an arm with seven joints goes. The wrist of a UR hangs too low for
+# that: leaning, it stays back.
+_LEFT, _RIGHT = (
+    (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
+    (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),
+)
+_LEANING = (0.0, math.cos(0.3), 0.0, math.sin(0.3))
 
 
 #: A small parallel gripper of our own for any flange: 0.5 kg, opens by 0.04 m to each side.
@@ -90,6 +107,7 @@ PANDA = ArmModel(
     urdf="franka_panda/panda.urdf",
     ee_link="panda_grasptarget",
     home=(0.0, -0.395, 0.0, -2.849, 0.0, 2.454, 0.7854),
+    handling_orientation=_RIGHT,
 )
 
 #: KUKA LBR iiwa 14; at home the tool points down at (0.42, 0, 0.25) m: its elbow cannot fold
@@ -101,6 +119,7 @@ IIWA = ArmModel(
     goals=Region((0.65, -0.2, 0.05), (0.7, 0.2, 0.15)),
     # The link's frame lies inside its body; the flange is 45 mm further out.
     gripper=replace(PARALLEL_GRIPPER, position=(0.0, 0.0, 0.045)),
+    handling_orientation=_RIGHT,
 )
 
 #: UFACTORY xArm 6; at home the tool points down at (0.25, 0, 0.2) m.
@@ -110,6 +129,7 @@ XARM6 = ArmModel(
     home=(0.0, -0.7665, -0.257, 0.0, 1.0235, 0.0),
     goals=Region((0.48, -0.2, 0.05), (0.58, 0.2, 0.15)),
     gripper=PARALLEL_GRIPPER,
+    handling_orientation=_RIGHT,
 )
 
 #: UFACTORY xArm 7; at home the tool points down at (0.25, 0, 0.2) m. Needs ``more-arms``.
@@ -119,6 +139,7 @@ XARM7 = ArmModel(
     home=(0.0, -0.7224, 0.0, 0.2634, 0.0, 0.9858, 0.0),
     goals=Region((0.48, -0.2, 0.05), (0.58, 0.2, 0.15)),
     gripper=PARALLEL_GRIPPER,
+    handling_orientation=_LEFT,
 )
 
 #: Universal Robots UR5; at home the tool points down at (0.35, 0, 0.2) m. Needs ``more-arms``.
@@ -127,6 +148,7 @@ UR5 = ArmModel(
     ee_link="tool0",
     home=(-0.3171, -1.9041, 2.1843, -1.851, -1.5708, 1.2536),
     gripper=PARALLEL_GRIPPER,
+    handling_orientation=_LEANING,
 )
 
 #: Universal Robots UR10; at home the tool points down at (0.35, 0, 0.2) m. Needs ``more-arms``.
@@ -135,4 +157,5 @@ UR10 = ArmModel(
     ee_link="tool0",
     home=(-0.4875, -2.1153, 2.5841, -2.0396, -1.5708, 1.0833),
     gripper=PARALLEL_GRIPPER,
+    handling_orientation=_LEANING,
 )

@@ -3,7 +3,8 @@
 Importing this module registers the ready-made combinations of an arm, a task, obstacles and an
 action as ``torchrl_safe/<Arm><Task><Obstacles><Action>-v0``; the names are the keys of ``ARMS``,
 ``TASKS``, ``OBSTACLES`` and ``ACTIONS``. Gymnasium's own syntax imports it on the way:
-``gymnasium.make("torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0")``.
+``gymnasium.make("torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0")``. The tasks of
+:data:`~torchrl_safe.envs.SUITE` are registered as ``torchrl_safe/<name>-v0``.
 """
 
 from itertools import product
@@ -18,6 +19,7 @@ except ImportError as error:
 from torchrl_safe.envs.gym.arm import ArmGymEnv
 from torchrl_safe.envs.gym.registered import ACTIONS, ARMS, OBSTACLES, TASKS, combination
 from torchrl_safe.envs.gym.safe import SafeGymEnv, SafeGymWrapper
+from torchrl_safe.envs.suite import SUITE
 
 __all__ = [
     "ACTIONS",
@@ -37,6 +39,12 @@ def _register() -> None:
             f"torchrl_safe/{''.join(parts)}-v0",
             entry_point=f"{__name__}:{ArmGymEnv.__name__}",
             kwargs=combination(*parts),
+        )
+    for name, task in SUITE.items():
+        gymnasium.register(
+            f"torchrl_safe/{name}-v0",
+            entry_point=f"{__name__}:{ArmGymEnv.__name__}",
+            kwargs=task.arguments,
         )
 
 

@@ -10,7 +10,7 @@ from torchrl_safe.envs.obstacles.layouts import (
     Scattered,
 )
 from torchrl_safe.envs.obstacles.moving import Motion, Moving, Patrol, Swing
-from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Look, Part, Shape, Sphere
 
 __all__ = [
     "Box",
@@ -18,10 +18,12 @@ __all__ = [
     "Cylinder",
     "Human",
     "InFront",
+    "Look",
     "Motion",
     "Moving",
     "NoObstacles",
     "Obstacles",
+    "Part",
     "Path",
     "Patrol",
     "Placement",

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from torchrl_safe._checks import check_array, check_positive
 from torchrl_safe.envs.obstacles.layouts import Placement
-from torchrl_safe.envs.obstacles.shapes import Capsule, Shape, Sphere
+from torchrl_safe.envs.obstacles.shapes import Capsule, Look, Part, Shape, Sphere
 from torchrl_safe.envs.rotations import from_z_axis
 from torchrl_safe.envs.state import Array
 
@@ -17,6 +18,9 @@ _REACHES = 16
 _SPREAD = 0.08
 # Lengths in m; the hand is the far end of the forearm, the head is given from the shoulder.
 _UPPER_ARM, _FOREARM, _HEAD = 0.28, 0.35, (0.05, -0.2, 0.25)
+# Colours of what is drawn.
+_SKIN, _HAIR, _EYE = (0.90, 0.69, 0.55), (0.27, 0.17, 0.10), (0.05, 0.05, 0.05)
+_SHIRT, _TROUSERS = (0.53, 0.33, 0.66), (0.25, 0.27, 0.38)
 # Between these distances of hand and shoulder the elbow is neither stretched nor folded flat.
 _NEAREST, _REACH = 0.12, 0.62
 
@@ -73,10 +77,11 @@ class Human:
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
+        hand = Part(Sphere(0.047, look=Look(_SKIN)), (0.0, 0.0, _FOREARM / 2))
         return (
-            Capsule(radius=0.05, length=_UPPER_ARM),
-            Capsule(radius=0.045, length=_FOREARM),
-            Sphere(radius=0.1),
+            Capsule(radius=0.05, length=_UPPER_ARM, look=Look(_SHIRT)),
+            Capsule(radius=0.045, length=_FOREARM, look=Look(_SHIRT, parts=(hand,))),
+            Sphere(radius=0.1, look=Look(_SKIN, parts=_BODY)),
         )
 
     def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
@@ -141,3 +146,42 @@ def _unit(vector: Array) -> Array:
 def _minimum_jerk(share: Array) -> Array:
     """Share of the way after a share of the time (Flash & Hogan 1985, eq. 3 for rest to rest)."""
     return share**3 * (10 - 15 * share + 6 * share**2)
+
+
+def _limb(
+    start: tuple[float, float, float],
+    end: tuple[float, float, float],
+    radius: float,
+    colour: tuple[float, float, float],
+) -> Part:
+    way = np.subtract(end, start)
+    x, y, z, w = from_z_axis(_unit(way)).tolist()
+    middle = np.add(start, way / 2).tolist()
+    shape = Capsule(radius, float(np.linalg.norm(way)), look=Look(colour))
+    return Part(shape, (middle[0], middle[1], middle[2]), (x, y, z, w))
+
+
+def _ball(position: tuple[float, float, float], radius: float, colour: Any) -> Part:
+    return Part(Sphere(radius, look=Look(colour)), position)
+
+
+def _body() -> tuple[Part, ...]:
+    """The rest of a person who leans over the table towards the robot, from the head's centre."""
+    right, left = (-0.05, 0.2, -0.25), (-0.05, -0.2, -0.25)
+    elbow, hand = (0.06, -0.27, -0.48), (-0.05, -0.24, -0.6)
+    return (
+        _ball((0.018, 0.0, 0.022), 0.102, _HAIR),
+        _ball((-0.09, 0.035, 0.015), 0.014, _EYE),
+        _ball((-0.09, -0.035, 0.015), 0.014, _EYE),
+        _ball((-0.1, 0.0, -0.02), 0.018, _SKIN),
+        _limb((0.01, 0.0, -0.08), (-0.03, 0.0, -0.24), 0.045, _SKIN),
+        _limb(right, left, 0.06, _SHIRT),
+        *(_limb((-0.02, y, -0.3), (0.25, 0.8 * y, -0.66), 0.1, _SHIRT) for y in (-0.08, 0.08)),
+        *(_limb((0.26, y, -0.72), (0.3, y, -1.3), 0.075, _TROUSERS) for y in (-0.09, 0.09)),
+        _limb(left, elbow, 0.05, _SHIRT),
+        _limb(elbow, hand, 0.045, _SHIRT),
+        _ball(hand, 0.047, _SKIN),
+    )
+
+
+_BODY = _body()

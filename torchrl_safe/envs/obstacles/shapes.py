@@ -2,11 +2,63 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from torchrl_safe._checks import check_array, check_not_negative, check_positive
+from torchrl_safe.envs.rotations import UPRIGHT
+
+
+@dataclass(frozen=True)
+class Part:
+    """A shape that is drawn with another one, and collides with nothing.
+
+    Args:
+        shape: the shape; its ``mass`` has no effect.
+        position: its centre in the frame of the other one, m.
+        orientation: a quaternion (x, y, z, w) in that frame.
+
+    Raises:
+        ValueError: if ``position`` or ``orientation`` has the wrong shape or is not finite.
+
+    Examples:
+        >>> Part(Sphere(0.02), position=(0.0, 0.0, 0.1)).position
+        (0.0, 0.0, 0.1)
+    """
+
+    shape: Shape
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float] = UPRIGHT
+
+    def __post_init__(self) -> None:
+        check_array("position", self.position, (3,))
+        check_array("orientation", self.orientation, (4,))
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a shape is drawn. The physics does not depend on it.
+
+    Args:
+        colour: red, green and blue, from 0 to 1.
+        parts: what is drawn with the shape, such as the body that belongs to a head.
+
+    Raises:
+        ValueError: if ``colour`` is not three numbers from 0 to 1.
+
+    Examples:
+        >>> Sphere(0.1, look=Look(colour=(0.9, 0.7, 0.6))).look.colour
+        (0.9, 0.7, 0.6)
+    """
+
+    colour: tuple[float, float, float]
+    parts: tuple[Part, ...] = ()
+
+    def __post_init__(self) -> None:
+        colour = check_array("colour", self.colour, (3,))
+        if not ((colour >= 0) & (colour <= 1)).all():
+            raise ValueError(f"colour must be three numbers from 0 to 1, got {self.colour}.")
 
 
 @dataclass(frozen=True)
@@ -17,6 +69,7 @@ class Cylinder:
         radius: m.
         height: m.
         mass: kg; 0 fixes it in place, anything else can be pushed and knocked over.
+        look: how it is drawn; by default in the colour of obstacles or of objects.
 
     Raises:
         ValueError: if a size is not positive or the mass is negative.
@@ -29,6 +82,7 @@ class Cylinder:
     radius: float = 0.05
     height: float = 0.2
     mass: float = 0.0
+    look: Look | None = field(default=None, repr=False, kw_only=True)
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius, height=self.height)
@@ -47,6 +101,7 @@ class Box:
     Args:
         half_extents: half of the size along its own x, y and z axes, m.
         mass: kg; 0 fixes it in place.
+        look: how it is drawn; by default in the colour of obstacles or of objects.
 
     Raises:
         ValueError: if a size is not positive or the mass is negative.
@@ -58,6 +113,7 @@ class Box:
 
     half_extents: tuple[float, float, float] = (0.05, 0.05, 0.1)
     mass: float = 0.0
+    look: Look | None = field(default=None, repr=False, kw_only=True)
 
     def __post_init__(self) -> None:
         if not (check_array("half_extents", self.half_extents, (3,)) > 0).all():
@@ -72,6 +128,7 @@ class Sphere:
     Args:
         radius: m.
         mass: kg; 0 fixes it in place.
+        look: how it is drawn; by default in the colour of obstacles or of objects.
 
     Raises:
         ValueError: if the radius is not positive or the mass is negative.
@@ -83,6 +140,7 @@ class Sphere:
 
     radius: float = 0.08
     mass: float = 0.0
+    look: Look | None = field(default=None, repr=False, kw_only=True)
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius)
@@ -102,6 +160,7 @@ class Capsule:
         radius: m.
         length: distance between the centres of the half balls, m.
         mass: kg; 0 fixes it in place.
+        look: how it is drawn; by default in the colour of obstacles or of objects.
 
     Raises:
         ValueError: if a size is not positive or the mass is negative.
@@ -114,6 +173,7 @@ class Capsule:
     radius: float = 0.05
     length: float = 0.1
     mass: float = 0.0
+    look: Look | None = field(default=None, repr=False, kw_only=True)
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius, length=self.length)

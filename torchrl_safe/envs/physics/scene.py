@@ -47,8 +47,11 @@ class Camera:
         eye: position of the camera, m.
         target: the point it looks at, m.
         field_of_view: vertical, degrees.
+        shadows: draw shadows, which show how high things are. Pictures then take two to three times
+            as long.
 
     Raises:
+        TypeError: if ``shadows`` is not True or False.
         ValueError: if a point is not three finite numbers, both are the same, or the field of view
             is not between 0 and 180 degrees.
 
@@ -60,6 +63,7 @@ class Camera:
     eye: tuple[float, float, float] = (1.0, -1.25, 0.7)
     target: tuple[float, float, float] = (0.3, 0.0, 0.3)
     field_of_view: float = 45.0
+    shadows: bool = False
 
     def __post_init__(self) -> None:
         if np.array_equal(
@@ -67,5 +71,6 @@ class Camera:
         ):
             raise ValueError(f"eye must not be where it looks, got {self.eye} for both.")
         check_positive(field_of_view=self.field_of_view)
+        check_flag(shadows=self.shadows)
         if self.field_of_view >= 180:
             raise ValueError(f"field_of_view must be less than 180, got {self.field_of_view}.")

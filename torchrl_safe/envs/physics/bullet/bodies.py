@@ -12,12 +12,20 @@ import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.arms.urdf import prepare_urdf
-from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Part, Shape, Sphere
 from torchrl_safe.envs.physics.bullet.engine import pybullet, pybullet_data
+from torchrl_safe.envs.physics.palette import (
+    FLOOR,
+    GOAL,
+    GOAL_RADIUS,
+    TABLE,
+    Colour,
+    colour,
+    ring,
+)
 from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.state import Array
 
-_WOOD = (0.72, 0.58, 0.42, 1.0)
 _UNLIMITED_EFFORT = 1e5
 # More than the fingers' motors can do, N.
 _GEAR_FORCE = 1e3
@@ -166,9 +174,10 @@ def load_furniture(
             for urdf, position in furniture
         ]
     table = Box(half_extents=(0.75, 0.6, 0.025))
-    body = add_shape(client, table, (0.5, 0, -0.025), _WOOD if visuals else None)
+    body = add_shape(client, table, (0.5, 0, -0.025), TABLE if visuals else None)
     if visuals:
-        pybullet.loadURDF(_data("plane.urdf"), (0, 0, -0.7), physicsClientId=client)
+        floor = _skin(client, [Part(Box(half_extents=(10, 10, 0.01)), (0, 0, -0.71))], FLOOR)
+        pybullet.createMultiBody(0, -1, floor, physicsClientId=client)
     return [body]
 
 
@@ -177,28 +186,50 @@ def load_body(client: int, urdf: str, position: Sequence[float]) -> int:
     return pybullet.loadURDF(_data(urdf), position, physicsClientId=client)
 
 
-def add_shape(
-    client: int, shape: Shape, position: Sequence[float], colour: Sequence[float] | None
-) -> int:
+def add_shape(client: int, shape: Shape, position: Sequence[float], default: Colour | None) -> int:
     """Adds a shape; without a colour it is simulated but not drawn."""
     geometry, size = _geometry(shape)
     body = pybullet.createCollisionShape(geometry, physicsClientId=client, **size)
     skin = -1
-    if colour is not None:
-        # PyBullet calls the same measure "height" of a shape and "length" of its skin.
-        size = {"length" if name == "height" else name: value for name, value in size.items()}
-        skin = pybullet.createVisualShape(
-            geometry, rgbaColor=colour, physicsClientId=client, **size
-        )
+    if default is not None:
+        parts = shape.look.parts if shape.look is not None else ()
+        skin = _skin(client, [Part(shape, (0, 0, 0)), *parts], colour(shape, default))
     return pybullet.createMultiBody(shape.mass, body, skin, position, physicsClientId=client)
 
 
-def add_marker(client: int, position: Sequence[float], colour: Sequence[float]) -> int:
-    """Adds a small ball that is drawn but not simulated."""
-    skin = pybullet.createVisualShape(
-        pybullet.GEOM_SPHERE, radius=0.02, rgbaColor=colour, physicsClientId=client
+def add_goal(client: int, position: Sequence[float]) -> list[int]:
+    """Adds ball and ring, which are drawn but not simulated."""
+    vertices, triangles = ring()
+    skins = [
+        pybullet.createVisualShape(
+            pybullet.GEOM_SPHERE, radius=GOAL_RADIUS, rgbaColor=GOAL, physicsClientId=client
+        ),
+        pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=vertices.tolist(),
+            indices=triangles.ravel().tolist(),
+            rgbaColor=GOAL,
+            physicsClientId=client,
+        ),
+    ]
+    return [
+        pybullet.createMultiBody(0, -1, skin, position, physicsClientId=client) for skin in skins
+    ]
+
+
+def _skin(client: int, parts: Sequence[Part], default: Colour) -> int:
+    geometries, sizes = zip(*(_geometry(part.shape) for part in parts), strict=True)
+    # Of what a shape has no use for PyBullet wants any value.
+    return pybullet.createVisualShapeArray(
+        shapeTypes=geometries,
+        radii=[size.get("radius", 1.0) for size in sizes],
+        halfExtents=[size.get("halfExtents", (1.0, 1.0, 1.0)) for size in sizes],
+        lengths=[size.get("height", 1.0) for size in sizes],
+        visualFramePositions=[part.position for part in parts],
+        visualFrameOrientations=[part.orientation for part in parts],
+        rgbaColors=[colour(part.shape, default) for part in parts],
+        physicsClientId=client,
     )
-    return pybullet.createMultiBody(0, -1, skin, position, physicsClientId=client)
 
 
 def _geometry(shape: Shape) -> tuple[int, dict[str, Any]]:

@@ -62,7 +62,14 @@ class Ruler:
             urdf_inertia=options.urdf_inertia,
             self_collision=False,
         )
-        table = load_furniture(client, options.furniture, visuals=False)
+        if options.furniture:
+            table = load_furniture(client, options.furniture, visuals=False)
+        else:
+            # As if it had no edges: twice as fast as a box.
+            plane = pybullet.createCollisionShape(
+                pybullet.GEOM_PLANE, planeNormal=(0, 0, 1), physicsClientId=client
+            )
+            table = [pybullet.createMultiBody(0, plane, physicsClientId=client)]
         # Put in its place from outside, whether it has a mass or not.
         self._obstacles = [
             add_shape(client, replace(shape, mass=0.0), (0, 0, -100), None) for shape in shapes

@@ -200,8 +200,9 @@ class BulletSimulator:
         if self._picture_world is None:
             self._picture_world = World(*self._build, visuals=True)
         pictures = []
-        for world in self.worlds:
+        for world, touched in zip(self.worlds, self._contact_distance <= 0, strict=True):
             self._picture_world.copy_from(world)
+            self._picture_world.light_up(touched.tolist())
             pictures.append(self._picture_world.picture(camera, width, height))
         return np.stack(pictures)
 

@@ -16,7 +16,7 @@ from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.bodies import (
-    add_marker,
+    add_goal,
     add_shape,
     load_arm,
     load_body,
@@ -24,6 +24,7 @@ from torchrl_safe.envs.physics.bullet.bodies import (
 )
 from torchrl_safe.envs.physics.bullet.engine import pybullet
 from torchrl_safe.envs.physics.bullet.readings import MovingBody, Readings, Vector, link_state
+from torchrl_safe.envs.physics.palette import OBJECT, OBSTACLE, TOUCHED, colour
 from torchrl_safe.envs.physics.paths import look_ahead
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.rotations import UPRIGHT
@@ -32,7 +33,6 @@ from torchrl_safe.envs.state import Array, Sensing
 if TYPE_CHECKING:
     from torchrl_safe.envs.physics.bullet.physics import Bullet
 
-_RED, _YELLOW, _BLUE = (0.85, 0.1, 0.1, 1.0), (1.0, 0.85, 0.1, 1.0), (0.15, 0.4, 0.8, 1.0)
 #: Centre of mass of the tool link, m, its velocity, m/s, and the link's angular velocity, rad/s.
 TOOL_MOTION = ("ee_centre", "ee_centre_velocity", "ee_angular_velocity")
 _LIMBO = (0.0, 0.0, -100.0)
@@ -122,18 +122,19 @@ class World:
             client, self._arm, furniture, len(shapes), sensing, fresh_links=options.fresh_links
         )
         self._senses = sensing != Sensing()
-        red, blue = (_RED, _BLUE) if visuals else (None, None)
+        dark, blue = (OBSTACLE, OBJECT) if visuals else (None, None)
         self._obstacles = [
-            add_shape(client, shape, _limbo(index), red) for index, shape in enumerate(shapes)
+            add_shape(client, shape, _limbo(index), dark) for index, shape in enumerate(shapes)
         ]
         self._objects = [
             add_shape(client, shape, _limbo(index + len(shapes)), blue)
             for index, shape in enumerate(objects)
         ]
+        self._shapes = tuple(shapes)
         self._is_fixed = [shape.mass == 0 for shape in shapes]
         urdf = options.target_urdf
         self._brick = brick = None if urdf is None else load_body(client, urdf, _LIMBO)
-        self._marker = add_marker(client, _LIMBO, _YELLOW) if visuals and brick is None else None
+        self._markers = add_goal(client, _LIMBO) if visuals and brick is None else []
         bodies = zip(self._obstacles, self._is_fixed, strict=True)
         self._movable = [body for body, fixed in bodies if not fixed] + self._objects
         if self._brick is not None:
@@ -199,9 +200,8 @@ class World:
             self._follow(*self._look_ahead(1)[0])
         for body, place in zip(self._objects, objects.tolist(), strict=True):
             self._place(body, place)
-        for target in (self._brick, self._marker):
-            if target is not None:
-                self._place(target, self._goal)
+        for target in (*([] if self._brick is None else [self._brick]), *self._markers):
+            self._place(target, self._goal)
         self._bodies = self._read_bodies()
         self._bodies_move = (
             bool(self._objects)
@@ -421,8 +421,20 @@ class World:
             self._place(mine, *other._pose(theirs))
         if self._brick is not None and other._brick is not None:
             self._place(self._brick, *other._pose(other._brick))
-        if self._marker is not None:
-            self._place(self._marker, other._goal)
+        for marker in self._markers:
+            self._place(marker, other._goal)
+
+    def light_up(self, touched: Sequence[bool]) -> None:
+        """Draws the obstacles that are touched in another colour, and the others in theirs."""
+        bodies = zip(self._obstacles, self._shapes, touched, strict=True)
+        for body, shape, lit in bodies:
+            pybullet.changeVisualShape(
+                body,
+                -1,
+                shapeIndex=0,
+                rgbaColor=TOUCHED if lit else colour(shape, OBSTACLE),
+                physicsClientId=self._client,
+            )
 
     def picture(self, camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
         """Returns an RGB picture, ``(height, width, 3)``."""
@@ -436,6 +448,9 @@ class World:
             view,
             projection,
             lightDirection=(1, -1, 2),
+            # Closer lights cast no shadow.
+            lightDistance=10,
+            shadow=camera.shadows,
             renderer=pybullet.ER_TINY_RENDERER,
             physicsClientId=self._client,
         )[2]

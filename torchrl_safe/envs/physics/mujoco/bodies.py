@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.physics.mujoco.contacts import set_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.mujoco.free import TO_MUJOCO
+from torchrl_safe.envs.physics.palette import (
+    OBJECT,
+    OBSTACLE,
+    TABLE as TABLE_COLOUR,
+    Colour,
+    colour,
+)
 
 #: Name of the table's shape; its top is at height 0.
 TABLE = "table"
 _TABLE = Box(half_extents=(0.75, 0.6, 0.025))
 _TABLE_PLACE = (0.5, 0.0, -0.025)
-_WOOD, _RED, _BLUE = (0.72, 0.58, 0.42, 1.0), (0.85, 0.1, 0.1, 1.0), (0.15, 0.4, 0.8, 1.0)
 
 
 def obstacle(index: int) -> str:
@@ -27,7 +37,9 @@ def thing(index: int) -> str:
 
 def add_table(spec: Any, *, reach: float) -> None:
     """Adds the table: a box, for what falls off it is to fall on."""
-    _add_geom(spec.worldbody, TABLE, _TABLE, _WOOD, free=False, reach=reach, pos=_TABLE_PLACE)
+    _add_geom(
+        spec.worldbody, TABLE, _TABLE, TABLE_COLOUR, free=False, reach=reach, pos=_TABLE_PLACE
+    )
 
 
 def add_obstacle(spec: Any, index: int, shape: Shape, *, reach: float) -> None:
@@ -39,33 +51,50 @@ def add_obstacle(spec: Any, index: int, shape: Shape, *, reach: float) -> None:
         shape: its shape.
         reach: distance from which on contacts with it are found, m.
     """
-    _add_body(spec, obstacle(index), shape, _RED, reach)
+    _add_body(spec, obstacle(index), shape, OBSTACLE, reach)
 
 
 def add_object(spec: Any, index: int, shape: Shape) -> None:
     """Adds an object that the task moves."""
-    _add_body(spec, thing(index), shape, _BLUE, 0.0)
+    _add_body(spec, thing(index), shape, OBJECT, 0.0)
 
 
-def _add_body(spec: Any, name: str, shape: Shape, colour: tuple[float, ...], reach: float) -> None:
+def add_parts(spec: Any, shapes: Sequence[Shape], objects: Sequence[Shape]) -> None:
+    """Adds what is drawn with obstacles and objects, and collides with nothing."""
+    names = [(obstacle(index), shape, OBSTACLE) for index, shape in enumerate(shapes)]
+    names += [(thing(index), shape, OBJECT) for index, shape in enumerate(objects)]
+    for name, shape, default in names:
+        for part in shape.look.parts if shape.look is not None else ():
+            spec.body(name).add_geom(
+                rgba=colour(part.shape, colour(shape, default)),
+                pos=part.position,
+                quat=np.array(part.orientation)[TO_MUJOCO],
+                contype=0,
+                conaffinity=0,
+                mass=0,
+                **_geometry(part.shape),
+            )
+
+
+def _add_body(spec: Any, name: str, shape: Shape, default: Colour, reach: float) -> None:
     free = shape.mass > 0
     body = spec.worldbody.add_body(name=name, mocap=not free)
     if free:
         body.add_freejoint(name=name)
-    _add_geom(body, name, shape, colour, free=free, reach=reach, mass=shape.mass)
+    _add_geom(body, name, shape, colour(shape, default), free=free, reach=reach, mass=shape.mass)
 
 
 def _add_geom(
     body: Any,
     name: str,
     shape: Shape,
-    colour: tuple[float, ...],
+    rgba: Colour,
     *,
     free: bool,
     reach: float,
     **options: Any,
 ) -> None:
-    geom = body.add_geom(name=name, rgba=colour, **options, **_geometry(shape))
+    geom = body.add_geom(name=name, rgba=rgba, **options, **_geometry(shape))
     set_contacts(geom, free=free, reach=reach)
 
 

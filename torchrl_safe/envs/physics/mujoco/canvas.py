@@ -61,13 +61,13 @@ class Canvas:
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
 
-    def draw(self, model: Any, data: Any, view: Any, picture: Any) -> None:
+    def draw(self, model: Any, data: Any, view: Any, picture: Any, *, shadows: bool) -> None:
         """Draws a world into an array, ``(height, width, 3)``."""
         self._gl.make_current()
         mujoco.mjv_updateScene(
             model, data, self._option, None, view, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         mujoco.mjr_render(self._rectangle, self._scene, self._context)
         mujoco.mjr_readPixels(picture, None, self._rectangle, self._context)
         # OpenGL counts lines from below.

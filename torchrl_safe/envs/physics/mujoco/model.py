@@ -15,6 +15,7 @@ from torchrl_safe.envs.physics.mujoco.arm import ArmParts, read_arm
 from torchrl_safe.envs.physics.mujoco.bodies import (
     add_object,
     add_obstacle,
+    add_parts,
     add_table,
     obstacle,
 )
@@ -109,6 +110,7 @@ def build_scenery(
     spec, _ = _read_arm(arm, scene, objects, visuals=True)
     dress_arm(spec)
     _add_bodies(spec, shapes, objects, reach=0.0)
+    add_parts(spec, shapes, objects)
     add_scenery(spec)
     return spec.compile()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.physics.mujoco.canvas import Canvas
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.palette import TOUCHED
 from torchrl_safe.envs.physics.scene import Camera
 from torchrl_safe.envs.state import Array
 
@@ -19,15 +21,18 @@ class Painter:
 
     Args:
         model: an ``MjModel`` of what is to be seen.
+        obstacles: names of the obstacles' shapes in it.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, obstacles: Sequence[str]) -> None:
         self._model, self._data = model, mujoco.MjData(model)
+        self._obstacles = [model.geom(name).id for name in obstacles]
+        self._colours = model.geom_rgba[self._obstacles].copy()
         self._canvas: Canvas | None = None
 
     def paint(
-        self, qpos: Array, mocap_pos: Array, mocap_quat: Array, goal: Array, camera: Camera,
-        width: int, height: int,
+        self, qpos: Array, mocap_pos: Array, mocap_quat: Array, goal: Array,
+        touched: NDArray[np.bool_], camera: Camera, width: int, height: int,
     ) -> NDArray[np.uint8]:  # fmt: skip
         """Returns an RGB picture of each world, ``(N, height, width, 3)``.
 
@@ -36,6 +41,7 @@ class Painter:
             mocap_pos: places of the obstacles that are put there, m, ``(N, b, 3)``.
             mocap_quat: their orientations (w, x, y, z), ``(N, b, 4)``.
             goal: goals, m, ``(N, 3)``.
+            touched: which obstacles light up, ``(N, m)``.
             camera: where to look from.
             width: in pixels.
             height: in pixels.
@@ -54,10 +60,13 @@ class Painter:
             data.qpos[:] = qpos[row]
             data.mocap_pos[:-1], data.mocap_pos[-1] = mocap_pos[row], goal[row]
             data.mocap_quat[:-1] = mocap_quat[row]
+            self._model.geom_rgba[self._obstacles] = np.where(
+                touched[row, :, None], TOUCHED, self._colours
+            )
             mujoco.mj_kinematics(self._model, data)
             mujoco.mj_comPos(self._model, data)
             mujoco.mj_camlight(self._model, data)
-            self._canvas.draw(self._model, data, view, picture)
+            self._canvas.draw(self._model, data, view, picture, shadows=camera.shadows)
         return pictures
 
     def close(self) -> None:

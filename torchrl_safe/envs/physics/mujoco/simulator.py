@@ -400,10 +400,12 @@ class MuJoCoSimulator:
     def pictures(self, camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
         """Returns an RGB picture of every world."""
         if self._painter is None:
-            self._painter = Painter(build_scenery(*self._build))
+            names = [obstacle(index) for index in range(len(self._sizes))]
+            self._painter = Painter(build_scenery(*self._build), names)
         return self._painter.paint(
-            self._qpos, self._mocap_pos, self._mocap_quat, self._goal, camera, width, height
-        )
+            self._qpos, self._mocap_pos, self._mocap_quat, self._goal, self._contact_distance <= 0,
+            camera, width, height,
+        )  # fmt: skip
 
     def close(self) -> None:
         """Frees what pictures are drawn with."""

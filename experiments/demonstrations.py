@@ -1,0 +1,147 @@
+"""Starts a policy from what a pilot would do, before it learns from rewards.
+
+Random actions hardly ever push a cube to its goal, and never pick one up: there is no reward to
+begin with. So the pilot begins, with noise in its actions, so that it also gets to where it has
+something to mend (DART, Laskey et al. 2017, arXiv 1703.09327). Then the policy acts, and the pilot
+says in every state what it would have done, which is what the policy learns (DAgger, Ross et al.
+2011, arXiv 1011.0686): who only imitates good episodes does not know what to do after a mistake.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import LossModule
+
+from experiments.agent import Standardize
+from experiments.algorithms import Training
+from experiments.config import Config
+from experiments.pilots import act, make_pilot
+from torchrl_safe.envs import ArmEnv
+
+# Share of the control steps in which the pilot acts, and the deviation of its noise.
+_FIRST, _NOISE = 0.25, 0.2
+# Control steps of each world between two times of learning. As many as there are new ones are then
+# drawn so many times from all; in the end, all of them.
+_STEPS, _TIMES, _LAST_TIMES = 32, 50, 40
+# Control steps in a minibatch, and Adam's learning rate, which falls to 0 in the end.
+_SIZE, _RATE = 512, 5e-3
+# How often the critics look again at what the learnt policy has earned and cost, and how long.
+_LOOKS, _PASSES = 6, 4
+
+
+def start_from_demonstrations(training: Training, env: TransformedEnv, config: Config) -> None:
+    """Teaches the policy what the pilot does, and the critics what comes of it.
+
+    Args:
+        training: what is to be trained, with an on-policy loss.
+        env: the environment of its training.
+        config: ``demonstrations``, the control steps in which the pilot says what it would do.
+    """
+    imitation = Imitation(training.actor)
+    stage = Stage(env)
+    new = _STEPS * env.batch_size.numel()
+    rounds = max(2, round(config.demonstrations / new))
+    flown = max(1, round(_FIRST * rounds))
+    for index in range(rounds):
+        if index < flown:
+            imitation.add(stage.play(_STEPS, _with_noise))
+            continue
+        if index == flown:
+            standardize(training.loss, imitation.seen["observation"])
+        imitation.learn(_TIMES * new)
+        imitation.add(stage.play(_STEPS, training.actor))
+    imitation.learn(_LAST_TIMES * rounds * new, settle=True)
+    played = Stage(env).play(env.base_env.max_episode_steps, training.actor)
+    fit_critics(training.loss, played, config.learning_rate)
+
+
+class Stage:
+    """An environment that goes on where it was, and its pilot.
+
+    Args:
+        env: the environment; it is reset.
+    """
+
+    def __init__(self, env: TransformedEnv) -> None:
+        arm = env.base_env
+        assert isinstance(arm, ArmEnv)
+        self.env, self.arm, self.pilot = env, arm, make_pilot(arm)
+        self.now = env.reset()
+
+    @torch.no_grad()
+    @set_exploration_type(ExplorationType.RANDOM)
+    def play(
+        self, steps: int, policy: Callable[[TensorDictBase], TensorDictBase]
+    ) -> TensorDictBase:
+        """Plays on, ``(worlds, steps)``; ``advice`` is what the pilot would have done."""
+        played = []
+        for _ in range(steps):
+            self.now["advice"] = torch.as_tensor(act(self.arm, self.pilot), dtype=torch.float32)
+            step, self.now = self.env.step_and_maybe_reset(policy(self.now))
+            played.append(step)
+        return torch.stack(played, dim=1)
+
+
+def _with_noise(tensordict: TensorDictBase) -> TensorDictBase:
+    advice = tensordict["advice"]
+    return tensordict.set("action", advice + _NOISE * torch.randn_like(advice))
+
+
+class Imitation:
+    """Makes what has been advised likely: behaviour cloning.
+
+    Args:
+        actor: the policy.
+    """
+
+    def __init__(self, actor: TensorDictModuleBase) -> None:
+        self.actor = actor
+        self.optimizer = torch.optim.Adam(actor.parameters(), lr=_RATE, fused=True)
+        self.seen: TensorDictBase = TensorDict({}, [0])
+
+    def add(self, played: TensorDictBase) -> None:
+        """Remembers states and what was advised in them."""
+        new = played.select(*self.actor.in_keys).set("action", played["advice"]).reshape(-1)
+        self.seen = torch.cat([self.seen, new]) if len(self.seen) else new
+
+    def learn(self, steps: int, *, settle: bool = False) -> None:
+        """Learns from steps drawn from all that it remembers; to settle, at a rate that falls."""
+        minibatches = math.ceil(steps / _SIZE)
+        for index in range(minibatches):
+            self.optimizer.param_groups[0]["lr"] = _RATE * (1 - settle * index / minibatches)
+            minibatch = self.seen[torch.randint(len(self.seen), (_SIZE,))]
+            likelihood = self.actor.get_dist(minibatch).log_prob(minibatch["action"])
+            likelihood.mean().neg().backward()
+            self.optimizer.step()
+            self.optimizer.zero_grad()
+
+
+def standardize(loss: LossModule, seen: Tensor) -> None:
+    """Gives what the networks see mean 0 and deviation 1 in the demonstrations."""
+    scale = 1 / seen.std(0).clamp_min(0.02)
+    for module in loss.modules():
+        if isinstance(module, Standardize):
+            module.loc.copy_(-seen.mean(0) * scale)
+            module.scale.copy_(scale)
+
+
+def fit_critics(loss: LossModule, played: TensorDictBase, rate: float) -> None:
+    """Fits the critics to what the policy has earned and cost; it stays as it is."""
+    critics = [each for name, each in loss.named_parameters() if "critic" in name]
+    optimizer = torch.optim.Adam(critics, lr=2 * rate, fused=True)
+    for _ in range(_LOOKS):
+        data = loss.estimate_advantages(played.clone(False)).reshape(-1).exclude("next")
+        for _ in range(_PASSES):
+            for minibatch in data[torch.randperm(len(data))].split(256):
+                losses = loss(minibatch)
+                (losses["loss_critic"] + losses["loss_cost_critic"]).backward()
+                optimizer.step()
+                loss.zero_grad()

@@ -1,0 +1,219 @@
+"""Policies without learning, to learn from: what to do next in any state that a world may be in.
+
+A pilot maps the state of all worlds to where each tool is to go next and how far its fingers are to
+be open. It remembers nothing: what it does is a function of the state, which a network can learn,
+and it can tell what is right wherever that network has got to (:mod:`experiments.demonstrations`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from torchrl_safe.envs import (
+    ArmEnv,
+    ArmState,
+    CartesianDelta,
+    Human,
+    Moving,
+    PickAndPlace,
+    Push,
+    Reach,
+    Task,
+)
+from torchrl_safe.envs.state import Array
+
+# Where the fingers' ends, 1 cm below the tool point, take the upper half of a cube, m.
+_LOW = 0.033
+# How far above the obstacles, and without any above the table, the tool goes over to the object.
+_OVER, _ABOVE_TABLE = 0.13, 0.12
+# Share of the largest action: a policy that squashes its output can give it.
+_SHARE = 0.9
+
+
+class Pilot(Protocol):
+    """What tells each tool where to go."""
+
+    def __call__(self, state: ArmState) -> tuple[Array, Array]:
+        """Returns where the tools go, m, ``(N, 3)``, and how far fingers open, 0 to 1, ``(N,)``."""
+
+
+def act(env: ArmEnv, pilot: Pilot) -> Array:
+    """Returns the actions of a pilot in the present state, ``(N, width)``."""
+    target, opening = pilot(env.arm_state)
+    move = (target - env.arm_state.ee_position) / env.action_mode.step
+    move *= _SHARE / np.maximum(_SHARE, np.abs(move).max(1, keepdims=True))
+    if not env.action_mode.moves_fingers:
+        return move
+    return np.column_stack([move, _SHARE * (2 * opening - 1)])
+
+
+@dataclass(frozen=True)
+class ReachPilot:
+    """Up, over everything, and down to the goal."""
+
+    def __call__(self, state: ArmState) -> tuple[Array, Array]:
+        top = np.maximum(_safe_height(state), state.goal[:, 2])
+        return _from_above(state.ee_position, state.goal, top), np.zeros(len(state.goal))
+
+
+@dataclass(frozen=True)
+class PickAndPlacePilot:
+    """From above to the object, over everything to the goal, and down.
+
+    Args:
+        slack: how much too low the object still may be when it is carried sideways, m.
+    """
+
+    slack: float = 0.0
+
+    def __call__(self, state: ArmState) -> tuple[Array, Array]:
+        tool, place = state.ee_position, state.object_position[:, 0]
+        goal, top = _away_from_obstacles(state), _safe_height(state)
+        from_object = tool - place
+        near = (_length(from_object[:, :2]) < 0.012) & (np.abs(tool[:, 2] - _LOW) < 0.012)
+        opening = state.finger_position.mean(axis=1)
+        held = (_length(from_object) < 0.03) & (opening < 0.024)
+        pick = _from_above(
+            tool, np.column_stack([place[:, :2], np.maximum(_LOW, place[:, 2])]), top
+        )
+        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]), self.slack)
+        target = np.where(held[:, None], put, pick)
+        return target, np.where(held | near, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class PushPilot:
+    """Round the obstacle on the side of the base, always behind the object.
+
+    Args:
+        room: half axes of the ellipse around each obstacle that the object stays out of, m, along
+            x, where the hand is wide, and y.
+    """
+
+    room: tuple[float, float] = (0.22, 0.15)
+    speed: float = 0.02
+
+    def __call__(self, state: ArmState) -> tuple[Array, Array]:
+        tool, place = state.ee_position, state.object_position[:, 0]
+        goal = _away_from_obstacles(state)
+        ahead = self._course(place[:, :2], goal[:, :2], state)
+        # Where the tool is around the object: how far from being behind it, as an angle.
+        out = tool[:, :2] - place[:, :2]
+        distance = _length(out)
+        side = ahead[:, 0] * out[:, 1] - ahead[:, 1] * out[:, 0]
+        along = (out * ahead).sum(1)
+        angle = np.arctan2(side, -along)
+        low = (tool[:, 2] < 0.065) & (distance < 0.12)
+        behind = place[:, :2] - 0.06 * ahead
+        above = _from_above(
+            tool, np.column_stack([behind, np.full(len(tool), _LOW)]), _safe_height(state)
+        )
+        # Around the object at the table, until it is behind it.
+        sign = np.sign(angle)
+        turn = angle - sign * np.minimum(np.abs(angle), 0.6)
+        direction = np.arctan2(-ahead[:, 1], -ahead[:, 0]) - turn
+        ring = place[:, :2] + 0.065 * np.column_stack([np.cos(direction), np.sin(direction)])
+        # Pushing where it has gone pushes it back to the line.
+        across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        forward = self.speed * np.clip(1 - (angle / 0.4) ** 2, 0, 1)[:, None]
+        push = tool[:, :2] + forward * ahead - side[:, None] * across
+        straight = (np.abs(angle) < 0.5)[:, None]
+        flat = np.where(straight, push, ring)
+        table = np.column_stack([flat, np.full(len(tool), _LOW)])
+        return np.where(low[:, None], table, above), np.zeros(len(tool))
+
+    def _course(self, place: Array, goal: Array, state: ArmState) -> Array:
+        """Which way the object is to go, unit vectors ``(N, 2)``."""
+        course = _unit(goal - place)
+        if not state.obstacle_present.any():
+            return course
+        # In units of the ellipse the obstacle is a circle of radius 1.
+        middle, room = state.obstacle_position[:, 0, :2], np.array(self.room)
+        here, there = (place - middle) / room, (goal - middle) / room
+        way = there - here
+        share = np.clip(-(here * way).sum(1) / (way**2).sum(1), 0, 1)[:, None]
+        nearest = _length(here + share * way)
+        # On the side of the base: to which side of the line from the obstacle the goal is.
+        turn = np.where(there[:, 1] < 0, -1.0, 1.0)[:, None]
+        out, radius = _unit(here), _length(here)[:, None]
+        around = turn * np.column_stack([out[:, 1], -out[:, 0]])
+        # Along the tangent of the circle, and outwards within it.
+        sine = np.minimum(1, 1 / np.maximum(radius, 1e-6))
+        tangent = np.sqrt(1 - sine**2) * -out + sine * around
+        tangent += np.maximum(0, 1 - radius) * 5 * out
+        detour = _unit(tangent * room)
+        blocked = (nearest < np.minimum(0.95, 0.95 * _length(there))) & state.obstacle_present[:, 0]
+        return np.where(blocked[:, None], detour, course)
+
+
+PILOTS: dict[type[Task], Pilot] = {
+    Reach: ReachPilot(),
+    Push: PushPilot(),
+    PickAndPlace: PickAndPlacePilot(),
+}
+
+
+def make_pilot(env: ArmEnv) -> Pilot:
+    """Makes the pilot of an environment's task.
+
+    It looks at what stands in the way, not at what moves: where that will be it cannot know, and
+    costs are to teach it to a policy.
+
+    Raises:
+        ValueError: if the task has none, or its actions do not move the tool.
+    """
+    if not isinstance(env.action_mode, CartesianDelta):
+        raise ValueError(f"demonstrations need Cartesian actions, got {env.action_mode}.")
+    for task, pilot in PILOTS.items():
+        if isinstance(env.task, task):
+            return _blind(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
+    raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
+
+
+def _blind(pilot: Pilot) -> Pilot:
+    """The pilot where no obstacles are."""
+
+    def fly(state: ArmState) -> tuple[Array, Array]:
+        nothing = np.zeros_like(state.obstacle_present)
+        return pilot(replace(state, obstacle_present=nothing))
+
+    return fly
+
+
+def _from_above(tool: Array, place: Array, top: Array, slack: float = 0.0) -> Array:
+    """The next stop on the way up, over and down to a place."""
+    off = _length(tool[:, :2] - place[:, :2])
+    floor = np.minimum(top, place[:, 2] + 5 * np.maximum(0, off - 0.012))
+    # Sideways only as far as it is high enough.
+    free = np.clip(1 - (floor - tool[:, 2] - slack) / 0.05, 0, 1)[:, None]
+    flat = tool[:, :2] + free * (place - tool)[:, :2]
+    return np.column_stack([flat, floor])
+
+
+def _safe_height(state: ArmState) -> Array:
+    """Where the hand is above all obstacles, m, ``(N,)``."""
+    if not state.obstacle_present.shape[1]:
+        return np.full(len(state.goal), _ABOVE_TABLE)
+    tops = state.obstacle_position[..., 2] + state.obstacle_size[:, 2]
+    return np.where(state.obstacle_present, tops + _OVER, _ABOVE_TABLE).max(1)
+
+
+def _away_from_obstacles(state: ArmState) -> Array:
+    """The goal, as far from the obstacles as still counts, with room for the gripper."""
+    present = state.obstacle_present[..., None]
+    if not present.size:
+        return state.goal
+    middle = np.where(present, state.obstacle_position, 0).sum(1) / np.maximum(1, present.sum(1))
+    away = (state.goal - middle) * (1, 1, 0)
+    return state.goal + np.where(present.any(1), 0.03 * _unit(away), 0)
+
+
+def _length(vectors: Array) -> Array:
+    return np.linalg.norm(vectors, axis=-1)
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

@@ -1,0 +1,255 @@
+"""Tables and figures of the suite.
+
+Runs are summed up as Agarwal et al. 2021 do, "Deep Reinforcement Learning at the Edge of the
+Statistical Precipice" (https://arxiv.org/abs/2108.13264): the interquartile mean over all runs of
+all tasks, performance profiles, and the bootstrap stratified by task. Of a run there are two
+scores: its success, and the largest of its costs in units of the limits, 1 and less where every
+limit is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchrl_safe.metrics import Estimate, interquartile_mean, mean
+
+Run = Mapping[str, Any]
+Limits = Mapping[str, Mapping[str, float]]
+
+# Okabe & Ito's colours, which the colour-blind tell apart; the same for an algorithm everywhere.
+_PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_DRAWS = 2000
+
+
+def colours(algorithms: Iterable[str]) -> dict[str, str]:
+    """A colour for each algorithm; PPO and PPO-Lagrangian have the same in every figure."""
+    rest = [name for name in algorithms if name not in ("ppo", "ppo-lagrangian")]
+    names = ["ppo", "ppo-lagrangian", *rest]
+    return {name: _PALETTE[index % len(_PALETTE)] for index, name in enumerate(names)}
+
+
+def report(runs: Sequence[Run], limits: Limits) -> str:
+    """Returns Markdown: the suite as a whole, then each task with each cost against its limit."""
+    return f"{whole(runs, limits)}\n\n{table(runs, limits)}\n"
+
+
+def table(runs: Sequence[Run], limits: Limits) -> str:
+    """Returns a Markdown table with a row for each cost of each task and algorithm."""
+    lines = [
+        "| task | algorithm | success | lowest | cost | limit | mean | worst seed | seeds within "
+        "| summed while training |",
+        "|---" * 10 + "|",
+    ]
+    for task, algorithm in _cells(runs):
+        mine = _select(runs, task, algorithm)
+        success = [run["evaluation"]["success"][0] for run in mine]
+        head = f"| {task} | {algorithm} | {np.mean(success):.1%} | {min(success):.1%} "
+        for name, limit in limits[task].items():
+            costs = [run["evaluation"][f"cost/{name}"][0] for run in mine]
+            summed = np.mean([run["history"][-1][f"summed/{name}"] for run in mine])
+            within = sum(cost <= limit for cost in costs)
+            lines.append(
+                f"{head}| {name} | {limit:g} | {np.mean(costs):.2f} | {max(costs):.2f} "
+                f"| {within}/{len(mine)} | {summed:,.0f} |"
+            )
+            head = "| | | | "
+    return "\n".join(lines)
+
+
+def whole(runs: Sequence[Run], limits: Limits) -> str:
+    """Returns a Markdown table with a row for each algorithm, over all tasks."""
+    lines = [
+        "| algorithm | success (IQM) | largest cost / limit (IQM) | runs above a limit "
+        "| tasks with a limit exceeded three times | cost while training / PPO's |",
+        "|---" * 6 + "|",
+    ]
+    algorithms = [*dict.fromkeys(run["algorithm"] for run in runs)]
+    for algorithm in algorithms:
+        success, excess = scores(runs, limits, algorithm)
+        middle, high = (_interval(interquartile_mean, score) for score in (success, excess))
+        above = _interval(mean, (excess > 1).double())
+        # The violation of a task is that of its mean over seeds.
+        thrice = sum(
+            any(
+                _mean_cost(_select(runs, task, algorithm), name) >= 3 * limit
+                for name, limit in limits[task].items()
+            )
+            for task in _tasks(runs)
+        )
+        training = "" if "ppo" not in algorithms else f"{_relative(runs, limits, algorithm):.2f}"
+        lines.append(
+            f"| {algorithm} | {_shown(middle, '.1%')} | {_shown(high, '.2f')} "
+            f"| {_shown(above, '.0%')} | {thrice}/{len(_tasks(runs))} | {training} |"
+        )
+    lines.append(
+        "\nIQM: interquartile mean over all runs. Brackets: 95 % stratified bootstrap. A run is "
+        "above a limit if the mean of one of its costs is."
+    )
+    return "\n".join(lines)
+
+
+def scores(
+    runs: Sequence[Run], limits: Limits, algorithm: str
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Success and largest cost in units of the limits, each of shape (tasks, seeds)."""
+    success, excess = [], []
+    for task in _tasks(runs):
+        mine = _select(runs, task, algorithm)
+        success.append([run["evaluation"]["success"][0] for run in mine])
+        excess.append(
+            [
+                max(run["evaluation"][f"cost/{name}"][0] / limit for name, limit in of_task)
+                for run in mine
+                for of_task in [limits[task].items()]
+            ]
+        )
+    return torch.tensor(success, dtype=torch.float64), torch.tensor(excess, dtype=torch.float64)
+
+
+def profile(
+    values: NDArray[np.float64], thresholds: NDArray[np.float64], *, seed: int = 0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The share of runs above each threshold, and its band: Agarwal et al. 2021, section 4.2.
+
+    Args:
+        values: scores of the runs, (tasks, seeds).
+        thresholds: (t,).
+        seed: seed of the bootstrap, in which each task draws its own runs.
+
+    Returns:
+        The shares, (t,), and the ends of their pointwise 95 % intervals, (2, t).
+    """
+    tasks, seeds = values.shape
+    drawn = np.random.default_rng(seed).integers(seeds, size=(_DRAWS, tasks, seeds))
+    again = np.take_along_axis(values[None], drawn, axis=2).reshape(_DRAWS, -1)
+    above = np.stack([(again > threshold).mean(1) for threshold in thresholds], axis=1)
+    share = (values.reshape(1, -1) > thresholds[:, None]).mean(1)
+    return share, np.quantile(above, (0.025, 0.975), axis=0)
+
+
+def plot_profiles(runs: Sequence[Run], limits: Limits, path: Path) -> None:
+    """Draws the performance profiles of success and of the largest cost."""
+    figure, axes = plt.subplots(1, 2, figsize=(9.6, 3.8))
+    algorithms = [*dict.fromkeys(run["algorithm"] for run in runs)]
+    success, excess = np.linspace(0, 1, 101), np.geomspace(0.01, 100, 121)
+    for algorithm, colour in colours(algorithms).items():
+        if algorithm not in algorithms:
+            continue
+        of_runs = scores(runs, limits, algorithm)
+        for axis, score, thresholds in zip(axes, of_runs, (success, excess), strict=True):
+            share, band = profile(score.numpy(), thresholds)
+            axis.step(thresholds, share, color=colour, where="post")
+            axis.fill_between(thresholds, *band, color=colour, alpha=0.2, step="post", lw=0)
+            # Where the curve is half-way down, at its right.
+            half = int(np.argmax(share <= max(share.max() / 2, 1e-9)))
+            axis.annotate(
+                f" {algorithm}",
+                (thresholds[half], share[half]),
+                xytext=(4, 6),
+                textcoords="offset points",
+                color=colour,
+                ha="left" if axis is axes[1] else "right",
+            )
+    axes[1].axvline(1, color="black", ls="--", lw=1)
+    axes[1].annotate("limit ", (1, 1.02), ha="right", va="bottom", annotation_clip=False)
+    axes[0].set(xlabel="success", ylabel="share of runs with more", ylim=(-0.02, 1.02))
+    axes[1].set(xlabel="largest cost / limit", xscale="log", ylim=(-0.02, 1.02))
+    _save(figure, axes, path)
+
+
+def plot_training(runs: Sequence[Run], limits: Limits, path: Path) -> None:
+    """Draws the costs summed over all frames of training: a panel for each cost of each task."""
+    panels = [(task, name) for task in _tasks(runs) for name in limits[task]]
+    columns = min(4, len(panels))
+    rows = -(-len(panels) // columns)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(3.1 * columns, 2.5 * rows), squeeze=False, sharex=False
+    )
+    axes = list(grid.flat)
+    algorithms = [*dict.fromkeys(run["algorithm"] for run in runs)]
+    for axis, (task, name) in zip(axes, panels, strict=False):
+        for algorithm, colour in colours(algorithms).items():
+            if algorithm not in algorithms:
+                continue
+            mine = _select(runs, task, algorithm)
+            frames = np.array([row["frames"] for row in mine[0]["history"]]) / 1000
+            sums = np.array([[row[f"summed/{name}"] for row in run["history"]] for run in mine])
+            axis.plot(frames, sums.mean(0), color=colour)
+            axis.fill_between(frames, sums.min(0), sums.max(0), color=colour, alpha=0.2, lw=0)
+            axis.annotate(
+                algorithm,
+                (frames[-1], sums.mean(0)[-1]),
+                xytext=(-2, 3),
+                textcoords="offset points",
+                ha="right",
+                color=colour,
+                fontsize=7,
+            )
+        axis.set_title(f"{task}\n{name}", fontsize=8)
+        axis.set_ylim(bottom=0)
+        axis.tick_params(labelsize=7)
+    for axis in axes[len(panels) :]:
+        axis.set_visible(False)
+    figure.supxlabel("thousand control steps of training", fontsize=9)
+    figure.supylabel("cost so far", fontsize=9)
+    _save(figure, axes, path)
+
+
+def _save(figure: Any, axes: Iterable[Any], path: Path) -> None:
+    for axis in axes:
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def _tasks(runs: Sequence[Run]) -> list[str]:
+    return [*dict.fromkeys(run["task"] for run in runs)]
+
+
+def _cells(runs: Sequence[Run]) -> list[tuple[str, str]]:
+    algorithms = dict.fromkeys(run["algorithm"] for run in runs)
+    return [(task, algorithm) for task in _tasks(runs) for algorithm in algorithms]
+
+
+def _select(runs: Sequence[Run], task: str, algorithm: str) -> list[Run]:
+    return [run for run in runs if (run["task"], run["algorithm"]) == (task, algorithm)]
+
+
+def _mean_cost(runs: Sequence[Run], name: str) -> float:
+    return float(np.mean([run["evaluation"][f"cost/{name}"][0] for run in runs]))
+
+
+def _relative(runs: Sequence[Run], limits: Limits, algorithm: str) -> float:
+    """Cost of all training in units of PPO's: the mean over the costs of all tasks."""
+
+    def summed(task: str, name: str, of: str) -> float:
+        mine = _select(runs, task, of)
+        return float(np.mean([run["history"][-1][f"summed/{name}"] for run in mine]))
+
+    shares = [
+        summed(task, name, algorithm) / max(summed(task, name, "ppo"), 1.0)
+        for task in _tasks(runs)
+        for name in limits[task]
+    ]
+    return float(np.mean(shares))
+
+
+def _interval(statistic: Any, values: torch.Tensor) -> Estimate:
+    """A statistic over all runs; of single seeds there is nothing to draw anew."""
+    if values.shape[1] == 1:
+        values = values.repeat(1, 2)
+    return statistic(values.unsqueeze(-1), resample="episodes")
+
+
+def _shown(estimate: Estimate, form: str) -> str:
+    value, low, high = (format(part.item(), form) for part in estimate)
+    return value if low == high == value else f"{value} [{low}, {high}]"

@@ -1,0 +1,110 @@
+"""Pilots do every task, past obstacles without a touch, from whatever state they find."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from worlds import ARMS
+
+from experiments.pilots import act, make_pilot
+from torchrl_safe.envs import (
+    ArmEnv,
+    CartesianDelta,
+    Human,
+    InFront,
+    JointDelta,
+    MuJoCo,
+    NoObstacles,
+    PickAndPlace,
+    Push,
+    Reach,
+    Scattered,
+)
+
+TASKS = {"reach": (Reach(), 60), "push": (Push(), 200), "pick": (PickAndPlace(), 100)}
+
+
+def settings(arm, task):
+    """Of an environment, with time enough."""
+    goal, steps = TASKS[task]
+    fingers = 0.04 if task == "pick" else None
+    held = None if task == "reach" else arm.handling_orientation
+    action = CartesianDelta(step=0.03, orientation=held, finger_step=fingers)
+    return {"task": goal, "action": action, "max_episode_steps": steps}
+
+
+def fly(env, noise=0.0):
+    """Plays one episode in each world; returns success and cost of each."""
+    env.reset()
+    pilot, generator = make_pilot(env), np.random.default_rng(0)
+    alive, success = np.ones((2, env.num_envs), bool), np.zeros(env.num_envs, bool)
+    alive, cost = alive[0], np.zeros(env.num_envs)
+    while alive.any():
+        action = act(env, pilot)
+        assert np.abs(action[:, :]).max() <= 0.9 + 1e-6
+        action = action + noise * generator.normal(size=action.shape)
+        action = torch.as_tensor(action, dtype=torch.float32)
+        result = env.step(TensorDict({"action": action}, batch_size=[env.num_envs]))["next"]
+        cost += np.where(alive, result["cost"].sum(1), 0)
+        success |= alive & result["success"][:, 0].numpy()
+        alive &= ~result["done"][:, 0].numpy()
+    return success, cost
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name == "panda" else pytest.mark.slow) for name in ARMS],
+)
+def test_success_costs_next_to_nothing(make_env, name, task):
+    arm = ARMS[name]
+    env = make_env(
+        ArmEnv, arm, num_envs=8, seed=0, physics=MuJoCo(threads=1), **settings(arm, task)
+    )
+    success, cost = fly(env)
+    assert success.all()
+    assert cost.mean() <= 0.25
+
+
+@pytest.mark.parametrize(
+    ("task", "obstacles"),
+    [("push", NoObstacles()), ("pick", NoObstacles()), ("pick", Scattered()), ("push", Human())],
+    ids=["push", "pick", "pick-scattered", "push-human"],
+)
+def test_success_without_an_obstacle_in_the_way(make_env, task, obstacles):
+    arm = ARMS["panda"]
+    chosen = {"obstacles": obstacles, "physics": MuJoCo(threads=1), **settings(arm, task)}
+    success, _ = fly(make_env(ArmEnv, arm, num_envs=8, seed=0, **chosen))
+    assert success.all()
+
+
+@pytest.mark.parametrize("task", ["push", "pick"])
+def test_mistakes_are_mended(make_env, task):
+    """Which is what there is to be learnt from a pilot."""
+    arm = ARMS["panda"]
+    chosen = {"obstacles": NoObstacles(), "physics": MuJoCo(threads=1), **settings(arm, task)}
+    success, _ = fly(make_env(ArmEnv, arm, num_envs=8, seed=0, **chosen), noise=0.2)
+    assert success.mean() >= 0.75
+
+
+def test_a_pilot_is_a_function_of_the_state(make_env):
+    """It says the same of each world, whatever the others are, and whenever it is asked."""
+    arm = ARMS["panda"]
+    chosen = {"num_envs": 4, "seed": 0, "physics": MuJoCo(threads=1), **settings(arm, "push")}
+    env = make_env(ArmEnv, arm, obstacles=InFront(), **chosen)
+    env.reset()
+    pilot = make_pilot(env)
+    first = act(env, pilot)
+    env.rollout(3, auto_reset=True)
+    env.set_seed(0)
+    env.reset()
+    np.testing.assert_array_equal(act(env, pilot), first)
+    alone = make_env(ArmEnv, arm, obstacles=InFront(), **{**chosen, "num_envs": 1})
+    alone.reset()
+    np.testing.assert_allclose(act(alone, make_pilot(alone))[0], first[0], atol=1e-12)
+
+
+def test_who_has_no_pilot(make_env):
+    env = make_env(ArmEnv, action=JointDelta(), physics=MuJoCo(threads=1))
+    with pytest.raises(ValueError, match="demonstrations need Cartesian actions, got JointDelta"):
+        make_pilot(env)
