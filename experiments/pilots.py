@@ -49,9 +49,11 @@ class Pilot(Protocol):
 def act(env: ArmEnv, pilot: Pilot) -> Array:
     """Returns the actions of a pilot in the present state, ``(N, width)``."""
     target, opening = pilot(env.arm_state)
-    move = (target - env.arm_state.ee_position) / env.action_mode.step
+    mode = env.action_mode
+    assert isinstance(mode, CartesianDelta)  # Or there would be no pilot.
+    move = (target - env.arm_state.ee_position) / mode.step
     move *= _SHARE / np.maximum(_SHARE, np.abs(move).max(1, keepdims=True))
-    if not env.action_mode.moves_fingers:
+    if not mode.moves_fingers:
         return move
     return np.column_stack([move, _SHARE * (2 * opening - 1)])
 
