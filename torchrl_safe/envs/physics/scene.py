@@ -49,7 +49,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Camera:
-    """Where :meth:`~torchrl_safe.envs.ArmEnv.render` looks from.
+    """A camera for :meth:`~torchrl_safe.envs.ArmEnv.render`.
 
     Args:
         eye: position of the camera, m.
