@@ -261,7 +261,7 @@ _HANDLING = {
     "hidden": 128,
     "learning_rate": 3e-4,
     "first_log_std": -1.7,
-    "last_log_std": -2.5,
+    "last_log_std": -3.5,
 }
 #: The kinds of task, by the names that options give them.
 TASKS: dict[str, type] = {"reach": Reach, "push": Push, "pick-and-place": PickAndPlace}

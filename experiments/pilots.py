@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from torchrl_safe.envs import (
+    PANDA,
     ArmEnv,
     ArmState,
     CartesianDelta,
@@ -21,7 +22,6 @@ from torchrl_safe.envs import (
     PickAndPlace,
     Push,
     Reach,
-    Task,
 )
 from torchrl_safe.envs.state import Array
 
@@ -49,9 +49,11 @@ class Pilot(Protocol):
 def act(env: ArmEnv, pilot: Pilot) -> Array:
     """Returns the actions of a pilot in the present state, ``(N, width)``."""
     target, opening = pilot(env.arm_state)
-    move = (target - env.arm_state.ee_position) / env.action_mode.step
+    mode = env.action_mode
+    assert isinstance(mode, CartesianDelta)  # Or there would be no pilot.
+    move = (target - env.arm_state.ee_position) / mode.step
     move *= _SHARE / np.maximum(_SHARE, np.abs(move).max(1, keepdims=True))
-    if not env.action_mode.moves_fingers:
+    if not mode.moves_fingers:
         return move
     return np.column_stack([move, _SHARE * (2 * opening - 1)])
 
@@ -67,13 +69,7 @@ class ReachPilot:
 
 @dataclass(frozen=True)
 class PickAndPlacePilot:
-    """From above to the object, over everything to the goal, and down.
-
-    Args:
-        slack: how much too low the object still may be when it is carried sideways, m.
-    """
-
-    slack: float = 0.0
+    """From above to the object, over everything to the goal, and down."""
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
         tool, place = state.ee_position, state.object_position[:, 0]
@@ -85,7 +81,7 @@ class PickAndPlacePilot:
         pick = _from_above(
             tool, np.column_stack([place[:, :2], np.maximum(_LOW, place[:, 2])]), top
         )
-        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]), self.slack)
+        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]))
         target = np.where(held[:, None], put, pick)
         return target, np.where(held | near, 0.0, 1.0)
 
@@ -97,9 +93,10 @@ class PushPilot:
     Args:
         room: half axes of the ellipse around each obstacle that the object stays out of, m, along
             x, where the hand is wide, and y.
+        speed: how far it is pushed in a control step, m.
     """
 
-    room: tuple[float, float] = (0.24, 0.15)
+    room: tuple[float, float] = (0.22, 0.15)
     speed: float = 0.02
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
@@ -155,13 +152,6 @@ class PushPilot:
         return np.where(blocked[:, None], detour, course)
 
 
-PILOTS: dict[type[Task], Pilot] = {
-    Reach: ReachPilot(),
-    Push: PushPilot(),
-    PickAndPlace: PickAndPlacePilot(),
-}
-
-
 def make_pilot(env: ArmEnv) -> Pilot:
     """Makes the pilot of an environment's task.
 
@@ -172,10 +162,17 @@ def make_pilot(env: ArmEnv) -> Pilot:
     """
     if not isinstance(env.action_mode, CartesianDelta):
         raise ValueError(f"demonstrations need Cartesian actions, got {env.action_mode}.")
-    for task, pilot in PILOTS.items():
-        if isinstance(env.task, task):
-            return _stepping_back(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
-    raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
+    # A Panda's own hand is wider than the gripper of the others, whose elbows fold less.
+    room = (0.27, 0.15) if env.arm == PANDA else (0.22, 0.15)
+    pilots: dict[type, Pilot] = {
+        Reach: ReachPilot(),
+        Push: PushPilot(room),
+        PickAndPlace: PickAndPlacePilot(),
+    }
+    if type(env.task) not in pilots:
+        raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
+    pilot = pilots[type(env.task)]
+    return _stepping_back(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
 
 
 def _stepping_back(pilot: Pilot) -> Pilot:
@@ -216,12 +213,12 @@ def _room(state: ArmState) -> tuple[Array, Array]:
     return room.min(1), _unit(_unit(away) + np.array([-1.0, 0, 0]))
 
 
-def _from_above(tool: Array, place: Array, top: Array, slack: float = 0.0) -> Array:
+def _from_above(tool: Array, place: Array, top: Array) -> Array:
     """The next stop on the way up, over and down to a place."""
     off = _length(tool[:, :2] - place[:, :2])
     floor = np.minimum(top, place[:, 2] + 5 * np.maximum(0, off - 0.012))
     # Sideways only as far as it is high enough.
-    free = np.clip(1 - (floor - tool[:, 2] - slack) / 0.05, 0, 1)[:, None]
+    free = np.clip(1 - (floor - tool[:, 2]) / 0.05, 0, 1)[:, None]
     flat = tool[:, :2] + free * (place - tool)[:, :2]
     return np.column_stack([flat, floor])
 
