@@ -25,6 +25,11 @@ NAME = "panda-reach-human"
 each_policy = pytest.mark.parametrize("name", CARDS)
 
 
+def test_there_are_some():
+    assert "panda-reach-in-front" in CARDS
+    assert {path.stem for path in FOLDER.glob("*.pt")} == set(CARDS) <= set(SUITE)
+
+
 @each_policy
 def test_each_plays_as_its_card_says(name):
     """64 other episodes are within four standard errors of the 256 of the card."""

@@ -52,9 +52,7 @@ class _Pairs(NamedTuple):
 
     def of(self, rows: NDArray[np.int_]) -> _Pairs:
         """Those of some worlds."""
-        return _Pairs(
-            *(part[rows] for part in self[:-1]), self.other
-        )
+        return _Pairs(*(part[rows] for part in self[:-1]), self.other)
 
 
 class _Step(NamedTuple):
