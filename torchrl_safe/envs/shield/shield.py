@@ -52,9 +52,7 @@ class _Pairs(NamedTuple):
 
     def of(self, rows: NDArray[np.int_]) -> _Pairs:
         """Those of some worlds."""
-        return _Pairs(
-            *(part[rows] for part in self[:-1]), self.other
-        )
+        return _Pairs(*(part[rows] for part in self[:-1]), self.other)
 
 
 class _Step(NamedTuple):
@@ -211,6 +209,8 @@ class Shield:
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
             turned = (then.joints @ change[again][:, :, None])[:, :, 0]
             needed = _needed(step, now.of(again), then) + turned
+            # And one more step like this one, as much slower as it can be, is to be safe there.
+            needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.joints))
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             change[again], solved[again] = project(
                 asked[again],
@@ -256,12 +256,15 @@ class Shield:
     def _spare(self, step: _Step, room: Array, joints: Array) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
         share = step.share * room
-        # From one step to the next, the joints can make a distance shrink by that much less.
-        brake = self.acceleration * step.duration**2 * _SURE * np.abs(joints).sum(axis=2)
+        brake = self._brake(step, joints)
         some = np.where(np.isfinite(room), np.maximum(room, 0), 0.0)
         # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
         stops = np.sqrt(brake * (brake / 4 + 2 * some)) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
+
+    def _brake(self, step: _Step, joints: Array) -> Array:
+        """How much less distances can shrink in a step than in the one before, m, ``(k, r)``."""
+        return self.acceleration * step.duration**2 * _SURE * np.abs(joints).sum(axis=2)
 
     def _least(self, step: _Step, now: _Pairs) -> Array:
         """By how much each distance has to change at least, m, ``(N, r)``."""
