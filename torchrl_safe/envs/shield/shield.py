@@ -150,7 +150,7 @@ class Shield:
 
     margin: float = 0.01
     rate: float = 20.0
-    table: float = 0.01
+    table: float = 0.015
     reach: float = 0.3
     acceleration: float = 10.0
     obstacle_speed: float | None = None
