@@ -205,8 +205,8 @@ class Config:
             )
         if [*self.costs] == ["correction"]:
             raise ValueError(
-                "costs must contain another cost beside correction, such as collision: it is what is "
-                "left without the shield."
+                "costs must contain another cost beside correction, such as collision: that is "
+                "what is left without the shield."
             )
         for name in self.algorithms:
             if self.paper and name in OFF_POLICY:
