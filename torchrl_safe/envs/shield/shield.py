@@ -96,8 +96,9 @@ class Shield:
     follow: a joint's velocity changes by no more than ``acceleration`` allows, or by no more than
     takes up the room that is left, whichever is more. So far from everything the shield changes
     nothing. The solver is exact; what is linear in it is checked: where the end of the step could
-    be too near, the distances there are measured too, and become inequalities of a second problem.
-    If there is no solution, the arm holds still, which the key ``shield_braked`` says.
+    be too near, the distances there are measured too, and become inequalities of a second problem,
+    in which one more step like this one, slower by b, has to be safe there as well. If there is no
+    solution, the arm holds still, which the key ``shield_braked`` says.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -107,7 +108,8 @@ class Shield:
     - ``reach`` is enough to stop in from the arm's largest speed,
     - and within a control step the arm does not turn so far that a shape comes near in its middle
       and leaves again: the distances at both ends are checked, those between follow from them to
-      within the same margin.
+      within the same margin,
+    - and there is a solution. An arm that has to hold still at full speed needs some way to do so.
 
     With obstacles that move, their velocity counts: the arm gives way as far as its joints allow.
     As their future is unknown, the guarantee is another: the arm is not the one that moves into
