@@ -268,6 +268,10 @@ TASKS: dict[str, type] = {"reach": Reach, "push": Push, "pick-and-place": PickAn
 # What differs between reaching, pushing and picking up; within a kind of task nothing does.
 KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: _HANDLING, PickAndPlace: _HANDLING}
 
+# The wide noise of make train is itself faster than a limit of the suite allows, and nearer to
+# joint limits: multipliers then rise before anything is learnt.
+_SUITE_KINDS = {**KINDS, Reach: {**KINDS[Reach], "first_log_std": -1.0}}
+
 
 #: How ``--help`` groups the options.
 GROUPS = {
@@ -302,7 +306,7 @@ def suite_config(name: SuiteTaskName, **others: Any) -> Config:
     if name not in SUITE:
         raise ValueError(f"suite_task must be one of {', '.join(SUITE)}, got {name!r}.")
     task = SUITE[name]
-    chosen = {"frames": task.frames, **KINDS[type(task.task)], **others}
+    chosen = {"frames": task.frames, **_SUITE_KINDS[type(task.task)], **others}
     return Config(**{**chosen, "suite_task": name})
 
 

@@ -93,7 +93,7 @@ class PushPilot:
             x, where the hand is wide, and y.
     """
 
-    room: tuple[float, float] = (0.22, 0.15)
+    room: tuple[float, float] = (0.24, 0.15)
     speed: float = 0.02
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
@@ -118,7 +118,7 @@ class PushPilot:
         ring = place[:, :2] + 0.065 * np.column_stack([np.cos(direction), np.sin(direction)])
         # Pushing where it has gone pushes it back to the line.
         across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-        forward = self.speed * np.clip(1 - (angle / 0.4) ** 2, 0, 1)[:, None]
+        forward = self.speed * np.clip(1 - np.abs(angle) / 0.6, 0.2, 1)[:, None]
         push = tool[:, :2] + forward * ahead - side[:, None] * across
         straight = (np.abs(angle) < 0.5)[:, None]
         flat = np.where(straight, push, ring)

@@ -36,7 +36,8 @@ from torchrl_safe.envs import (
 )
 from torchrl_safe.envs.shield.projection import project
 
-# Of the room above the margin, what a control step of 1/20 s may use up.
+# With that, a control step of 1/20 s may use up this share of the room above the margin.
+SLOW = Shield(margin=0.02, rate=5.0)
 SHARE = 1 - np.exp(-5 / 20)
 # A Cartesian action towards the table.
 DOWN = torch.tensor([0.0, 0.0, -1.0])
@@ -184,7 +185,7 @@ def test_measuring_changes_nothing(make_env, engine):
 def turn(make_env, turntable, sphere, action=1.0, **settings):
     """A step of the bar towards a ball beside its end; returns the environment."""
     layout = Places(Sphere(0.1), at=[sphere])
-    env = make_env(ArmEnv, **{"shield": Shield(), **turntable, "obstacles": layout, **settings})
+    env = make_env(ArmEnv, **{"shield": SLOW, **turntable, "obstacles": layout, **settings})
     env.reset()
     step(env, action)
     return env
@@ -198,6 +199,23 @@ def test_a_distance_shrinks_by_its_share(make_env, engine, turntable):
     assert state.shield_correction[0] == pytest.approx(0.1 - allowed, abs=1e-4)
     assert not state.shield_braked[0]
     assert state.joint_position[0, 0] == pytest.approx(allowed, rel=0.05)
+
+
+def test_a_distance_leaves_room_to_stop_in(make_env, engine, turntable):
+    """By hand: a third of 10 rad/s^2 at a lever of 0.45 m, over 1/20 s."""
+    shield = Shield(margin=0.02, rate=1e3)
+    env = turn(make_env, turntable, (0.45, 0.25, 0.5), shield=shield)
+    brake = 10 * 0.05**2 * 0.45 / 3
+    allowed = (np.sqrt(brake**2 / 4 + 2 * brake * 0.08) - brake / 2) / 0.45
+    # A little more: what is nearest at the end of the step is another point.
+    assert env.arm_state.shield_correction[0] == pytest.approx(0.1 - allowed, abs=2e-3)
+    assert not env.arm_state.shield_braked[0]
+    # And it stops in it, as fast as it may.
+    steps = [step(env, 1.0) for _ in range(30)]
+    assert not any(after["cost"].any() for after in steps)
+    state = env.arm_state
+    near = env._simulator.nearest(np.arange(1), state.joint_position, state.finger_position)
+    assert near.distance.min() == pytest.approx(0.02, abs=2e-3)
 
 
 def test_what_leads_away_is_left_alone(make_env, engine, turntable):
@@ -243,7 +261,7 @@ def test_what_may_come_is_not_approached(make_env, engine, turntable):
 def test_between_two_that_are_too_near_it_brakes(make_env, engine, turntable):
     """Each would have the bar move towards the other."""
     layout = Places(Sphere(0.1), Sphere(0.1), at=[(0.45, 0.16, 0.5), (0.45, -0.16, 0.5)])
-    env = make_env(ArmEnv, **{**turntable, "obstacles": layout, "shield": Shield()})
+    env = make_env(ArmEnv, **{**turntable, "obstacles": layout, "shield": SLOW})
     env.reset()
     after = step(env, 1.0)
     assert after["shield_braked"].item()

@@ -120,8 +120,8 @@ _BESIDE_A_PERSON: dict[str, Cost] = {
     "collision": Collision(),
     "separation": SpeedAndSeparation(),
 }
-# Who hardly waits is there before the arm has passed.
-_BUSY_PERSON = Human(pause=(0.05, 0.3))
+# Who hardly waits is there before the arm has passed; with the hand at rest, no goal is too near.
+_BUSY_PERSON = Human(shoulder=(1.1, 0.3, 0.4), rest=(0.95, 0.4, 0.2), pause=(0.05, 0.3))
 
 
 def _handling(arm: ArmModel, finger_step: float | None = None) -> CartesianDelta:

@@ -20,6 +20,8 @@ from torchrl_safe.envs.vectors import cross
 _ERROR = 0.1
 # Of what the joints hardly move, m/rad, and of joints without limits, rad.
 _SHORTEST, _FAR = 1e-3, 1e3
+# Of what the joints can do to stop, the part that is counted on: others may have to turn on.
+_SURE = 1 / 3
 
 
 class Shielded(NamedTuple):
@@ -38,6 +40,8 @@ class _Pairs(NamedTuple):
 
     #: Distance above the margin, m, ``(k, r)``; infinite where there is no pair.
     room: Array
+    #: How much of that may be used up in the step, m, ``(k, r)``; negative where it has to grow.
+    spare: Array
     #: By how much the obstacle will shrink it in the next step, m, ``(k, r)``; not negative.
     closing: Array
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
@@ -49,7 +53,7 @@ class _Pairs(NamedTuple):
     def of(self, rows: NDArray[np.int_]) -> _Pairs:
         """Those of some worlds."""
         return _Pairs(
-            self.room[rows], self.closing[rows], self.joints[rows], self.fingers[rows], self.other
+            *(part[rows] for part in self[:-1]), self.other
         )
 
 
@@ -70,22 +74,32 @@ class Shield:
 
     Before each control step it measures every convex shape of the arm against every obstacle and
     the table, and takes the joint targets :math:`q + x` nearest to those asked for,
-    :math:`q + w`, with which no distance d shrinks faster than a rate times what is left of it
-    above a margin, a control barrier function in discrete time (Ames et al. 2019, arXiv
-    1903.11199; Agrawal and Sreenath 2017, RSS):
+    :math:`q + w`, with which no distance d uses up more than s of the room :math:`r = d -
+    \text{margin}` that it has left:
 
     .. math::
         \min_x |x - w|^2 \quad\text{such that}\quad
-        \nabla d_i^\top x - c_i \ge -(1 - e^{-\text{rate} \cdot T}) (d_i - \text{margin})
-        \quad\text{for all } i, \qquad l \le x \le u
+        \nabla d_i^\top x - c_i \ge -s(r_i) \quad\text{for all } i, \qquad l \le x \le u
 
-    T is the duration of the control step, c how far the obstacle comes nearer in it. The bounds l
-    and u keep joints within their limits and speeds, and within what motors can follow: a joint's
-    velocity changes by no more than ``acceleration`` allows, or by no more than takes up the room
-    that is left, whichever is more. So far from everything the shield changes nothing. The solver
-    is exact; what is linear in it is checked: where the end of the step could be too near, the
-    distances there are measured too, and become inequalities of a second problem. If there is no
-    solution, the arm holds still, which the key ``shield_braked`` says.
+    T is the duration of the control step, c how far the obstacle comes nearer in it, and s a
+    control barrier function in discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and
+    Sreenath 2017, RSS), with which the arm can always stop:
+
+    .. math::
+        s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\ \sqrt{b^2 / 4 + 2 b r} - b / 2\right),
+        \qquad b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
+
+    The first part is a share of the room. The second is as much as leaves room to stop in, where
+    the distance shrinks by b less in each following step: a third of what all joints together
+    can do. In negative room, inside the margin, :math:`s = (1 - e^{-\text{rate} \cdot T})
+    r` has the arm go away.
+
+    The bounds l and u keep joints within their limits and speeds, and within what motors can
+    follow: a joint's velocity changes by no more than ``acceleration`` allows, or by no more than
+    takes up the room that is left, whichever is more. So far from everything the shield changes
+    nothing. The solver is exact; what is linear in it is checked: where the end of the step could
+    be too near, the distances there are measured too, and become inequalities of a second problem.
+    If there is no solution, the arm holds still, which the key ``shield_braked`` says.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -113,14 +127,14 @@ class Shield:
         margin: distance that the arm keeps from obstacles, m.
         rate: largest rate at which what is left above the margin shrinks, 1/s. Smaller slows down
             from further away.
-        table: distance that the arm keeps from the table, m.
+        table: distance that the arm keeps from the table, m; it has no edges.
         reach: distance up to which is measured, m. A larger one takes longer.
         acceleration: what motors can follow, rad/s^2: within it joints arrive where they are told
             to.
         obstacle_speed: if given, obstacles are taken to come as fast as that at any time, m/s,
             however slow they are now: the arm stops before they could touch it while it moves.
             ``None`` counts on the velocity that they have.
-        workspace: if given, where the tool point has to stay; it slows down before the walls.
+        workspace: if given, where the tool point has to stay; it keeps the margin from the walls.
 
     Raises:
         TypeError: if ``workspace`` is not a Region.
@@ -136,8 +150,8 @@ class Shield:
         >>> env.close()
     """
 
-    margin: float = 0.02
-    rate: float = 5.0
+    margin: float = 0.01
+    rate: float = 20.0
     table: float = 0.01
     reach: float = 0.3
     acceleration: float = 10.0
@@ -235,18 +249,28 @@ class Shield:
             speed = ((velocity + cross(spin, arm)) * near.normal).sum(axis=2)
             # What goes away may stop at any time.
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
-        return _Pairs(
-            room, closing, near.jacobian[..., :count], near.jacobian[..., count:], near.other
-        )
+        joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
+        spare = self._spare(step, room, joints)
+        return _Pairs(room, spare, closing, joints, moved, near.other)
+
+    def _spare(self, step: _Step, room: Array, joints: Array) -> Array:
+        """How much of the room may be used up in a step, m, ``(k, r)``."""
+        share = step.share * room
+        # From one step to the next, the joints can make a distance shrink by that much less.
+        brake = self.acceleration * step.duration**2 * _SURE * np.abs(joints).sum(axis=2)
+        some = np.where(np.isfinite(room), np.maximum(room, 0), 0.0)
+        # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
+        stops = np.sqrt(brake * (brake / 4 + 2 * some)) - brake / 2
+        return np.where(room > 0, np.minimum(share, stops), share)
 
     def _least(self, step: _Step, now: _Pairs) -> Array:
         """By how much each distance has to change at least, m, ``(N, r)``."""
-        least = now.closing - step.share * now.room
+        least = now.closing - now.spare
         if self.obstacle_speed is None:
             return least
         moves = now.other < step.state.obstacle_position.shape[1]
         come = step.duration * self.obstacle_speed * moves
-        return np.maximum(least, np.minimum(come - step.share * now.room, 0))
+        return np.maximum(least, np.minimum(come - now.spare, 0))
 
     def _bounds(self, step: _Step, now: _Pairs, longest: Array) -> tuple[Array, Array]:
         """How far the joints may turn, rad, each ``(N, n)``."""
@@ -270,24 +294,30 @@ class Shield:
             return rows, least
         tool, walls = step.state.ee_position, self.workspace
         linear = step.simulator.jacobian(step.state.joint_position)[:, :3]
-        room = np.concatenate([tool - walls.low, walls.high - tool], axis=1)
+        room = np.concatenate([tool - walls.low, walls.high - tool], axis=1) - self.margin
+        inwards = np.concatenate([linear, -linear], axis=1)
         return (
-            np.concatenate([rows, linear, -linear], axis=1),
-            np.concatenate([least, -step.share * room], axis=1),
+            np.concatenate([rows, inwards], axis=1),
+            np.concatenate([least, -self._spare(step, room, inwards)], axis=1),
         )
 
 
 def _needed(step: _Step, now: _Pairs, then: _Pairs) -> Array:
     """How much further apart each pair at the end of a step has to be than it is, m, ``(k, r)``."""
     # Each shape may use up what the nearest one may.
-    room = np.full((len(now.room), now.other.max(initial=0) + 1), np.inf)
-    for other in range(room.shape[1]):
-        room[:, other] = now.room[:, now.other == other].min(axis=1, initial=np.inf)
-    kept = (1 - step.share) * np.where(np.isfinite(room), room, 0.0)
+    kept = np.zeros((len(now.room), now.other.max(initial=0) + 1))
+    for other in range(kept.shape[1]):
+        of_other = (now.room - now.spare)[:, now.other == other]
+        nearest = np.where(np.isfinite(of_other), of_other, np.inf).min(axis=1, initial=np.inf)
+        kept[:, other] = np.where(np.isfinite(nearest), nearest, 0.0)
     return kept[:, then.other] + then.closing - then.room
 
 
 def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
-    """Asks for no more than half of what the joints can do: else for not coming nearer."""
+    """Asks for no more than half of what the joints can do beyond how they turn now.
+
+    The middle of the bounds is how they turn now. What is left of a wish is not coming nearer.
+    """
     best = np.where(rows > 0, rows * upper[:, None], rows * lower[:, None]).sum(axis=2)
-    return np.minimum(least, np.maximum(best / 2, 0))
+    middle = (rows @ (0.5 * (lower + upper))[:, :, None])[:, :, 0]
+    return np.minimum(least, np.maximum((best + np.maximum(middle, 0)) / 2, 0))
