@@ -62,6 +62,11 @@ def test_each_is_of_its_task_and_small(name):
     assert name in card["trained"]
 
 
+def test_it_is_evaluated_by_its_name(capsys):
+    evaluate.main(evaluate.Config(Path("panda-reach-in-front"), episodes=2, envs=2))
+    assert "| panda-reach-in-front | " in capsys.readouterr().out
+
+
 @pytest.fixture
 def packaged(tmp_path, monkeypatch):
     """A folder of policies with one in it, in place of the package's."""
