@@ -275,6 +275,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "ppo-shield": OnPolicy(
         _of_ppo(PPOLagrangianLoss), keep_multiplier, compiles=True, shield=Shield()
     ),
+    "ppo-lagrangian-shield": OnPolicy(_of_ppo(PPOLagrangianLoss), compiles=True, shield=Shield()),
     "ppo-lagrangian": OnPolicy(_of_ppo(PPOLagrangianLoss), compiles=True),
     "kl-ppo-lagrangian": OnPolicy(_wrapping(LagrangianLoss, KLPENPPOLoss)),
     "a2c-lagrangian": OnPolicy(_wrapping(LagrangianLoss, A2CLoss), epochs=1),

@@ -21,6 +21,7 @@ Observation = Literal["full", "paper"]
 AlgorithmName = Literal[
     "ppo",
     "ppo-shield",
+    "ppo-lagrangian-shield",
     "ppo-lagrangian",
     "kl-ppo-lagrangian",
     "a2c-lagrangian",
@@ -51,7 +52,15 @@ SuiteTaskName = Literal[
     "ur10-pick-workspace",
     "xarm7-pick-scattered",
 ]
-CostName = Literal["collision", "contact-force", "joint-limit", "proximity", "separation", "speed"]
+CostName = Literal[
+    "collision",
+    "contact-force",
+    "correction",
+    "joint-limit",
+    "proximity",
+    "separation",
+    "speed",
+]
 MultiplierRule = Literal["pid", "dual-ascent", "fixed"]
 #: The algorithms that learn from replay; they need bounded actions.
 OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
@@ -80,14 +89,16 @@ class Config:
     settings that all tasks of its kind have."""
     algorithms: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
     """What to train; ppo is PPO-Lagrangian with its multiplier fixed at 0, and ppo-shield the same
-    with a filter of its actions that keeps the arm off the obstacles while it learns."""
+    with a filter of its actions that keeps the arm off the obstacles while it learns; with
+    ppo-lagrangian-shield and a limit of the correction, the policy needs no filter later."""
     shield: bool = False
     """Train ppo-shield as well, and draw the collisions summed over all of training."""
     cost_limit: float = 0.5
     """Limit of the expected cost of an episode: control steps in which the arm collides."""
     costs: dict[CostName, float] = dataclasses.field(default_factory=dict)
     """Several costs instead, each with its limit: --costs collision 0.5 speed 2. The speed is that
-    of the tool above 1 m/s; the others are as the library has them by default."""
+    of the tool above 1 m/s; the others are as the library has them by default. The correction needs
+    an algorithm with a shield."""
     frames: int = 128_000
     """Control steps to train for, with each algorithm."""
     demonstrations: int = 0
@@ -184,8 +195,19 @@ class Config:
             *("arm", "task", "obstacles", "action", "observation", "paper", "costs", "cost_limit"),
         )
         self._refuse("costs", bool(self.costs), "cost_limit")
-        if self.paper and "ppo-shield" in self.chosen:
+        shielded = {"ppo-shield", "ppo-lagrangian-shield"}
+        if self.paper and shielded.intersection(self.chosen):
             raise ValueError("shield must be False with paper, whose environment has none.")
+        if "correction" in self.costs and not shielded.issuperset(self.chosen):
+            raise ValueError(
+                f"costs must not contain correction with algorithms without a shield, got "
+                f"{self.chosen}."
+            )
+        if [*self.costs] == ["correction"]:
+            raise ValueError(
+                "costs must contain another cost beside correction, such as collision: that is "
+                "what is left without the shield."
+            )
         for name in self.algorithms:
             if self.paper and name in OFF_POLICY:
                 raise ValueError(
@@ -306,7 +328,7 @@ def suite_config(name: SuiteTaskName, **others: Any) -> Config:
     if name not in SUITE:
         raise ValueError(f"suite_task must be one of {', '.join(SUITE)}, got {name!r}.")
     task = SUITE[name]
-    chosen = {"frames": task.frames, **_SUITE_KINDS[type(task.task)], **others}
+    chosen = {**_SUITE_KINDS[type(task.task)], "frames": task.frames, **others}
     return Config(**{**chosen, "suite_task": name})
 
 

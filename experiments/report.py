@@ -27,7 +27,11 @@ _SMOOTH = 5
 
 def table(results: dict[str, Any]) -> str:
     """Returns a Markdown table: a row for each algorithm, estimates with 95 % intervals."""
-    rows = {name: run["evaluation"] for name, run in results["algorithms"].items()}
+    rows = {}
+    for name, run in results["algorithms"].items():
+        rows[name] = run["evaluation"]
+        if "without_shield" in run:
+            rows[f"{name}, without its shield"] = run["without_shield"]
     return figures_table(rows, results["cost_limits"])
 
 
@@ -39,7 +43,10 @@ def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Mapping[
         "|---" * (len(columns) + 1) + "|",
     ]
     for name, row in rows.items():
-        cells = (_cell(*row[column], share=_is_share(column)) for column in columns)
+        cells = (
+            _cell(*row[column], share=_is_share(column)) if column in row else ""
+            for column in columns
+        )
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     if len(cost_limits) == 1:
         (limit,) = cost_limits.values()
@@ -80,7 +87,9 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
     runs = results["algorithms"]
     history = next(iter(runs.values()))["history"]
     costs = [key for key in max(history, key=len) if key.startswith("cost/")]
-    sums = [f"summed/{key.partition('/')[2]}" for key in costs if "ppo-shield" in runs]
+    sums = [
+        f"summed/{key.partition('/')[2]}" for key in costs if any("shield" in name for name in runs)
+    ]
     keys = ["return", *costs, *sums]
     with figure_style():
         figure, grid = plt.subplots(

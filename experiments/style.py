@@ -39,6 +39,7 @@ _NAMES_AND_COLOURS: dict[str, tuple[str, str]] = {
     "ppo-saute": ("PPO-Sauté", "#8c6d31"),
     "ppo-early-termination": ("PPO, early termination", "#bd9e39"),
     "ppo-shield": ("PPO with shield", INK),
+    "ppo-lagrangian-shield": ("Lagrangian, shield", GREY),
 }
 
 

@@ -31,7 +31,40 @@ _DRAWS = 2000
 
 def report(runs: Sequence[Run], limits: Limits) -> str:
     """Returns Markdown: the suite as a whole, then each task with each cost against its limit."""
-    return f"{whole(runs, limits)}\n\n{table(runs, limits)}\n"
+    parts = [whole(runs, limits), table(runs, limits)]
+    if any("without_shield" in run for run in runs):
+        parts.append(shield_table(runs))
+    return "\n\n".join(parts) + "\n"
+
+
+def shield_table(runs: Sequence[Run]) -> str:
+    """Returns a Markdown table of what a shield changes: collisions of all training, and after."""
+    lines = [
+        "| task | algorithm | seeds | collisions while training | success | return "
+        "| without its shield: success | collisions of an episode |",
+        "|---" * 8 + "|",
+    ]
+    for task, algorithm in _cells(runs):
+        mine = _select(runs, task, algorithm)
+        if "cost/collision" not in mine[0]["evaluation"]:
+            continue
+        summed = [run["history"][-1]["summed/collision"] for run in mine]
+        figures = [_mean_of(mine, "evaluation", name) for name in ("success", "return")]
+        without = ["", ""]
+        if "without_shield" in mine[0]:
+            success, cost = (
+                _mean_of(mine, "without_shield", name) for name in ("success", "cost/collision")
+            )
+            without = [f"{success:.1%}", f"{cost:.2f}"]
+        lines.append(
+            f"| {task} | {algorithm} | {len(mine)} | {np.mean(summed):,.0f} | {figures[0]:.1%} "
+            f"| {figures[1]:.2f} | {without[0]} | {without[1]} |"
+        )
+    return "\n".join(lines)
+
+
+def _mean_of(runs: Sequence[Run], part: str, name: str) -> float:
+    return float(np.mean([run[part][name][0] for run in runs]))
 
 
 def table(runs: Sequence[Run], limits: Limits) -> str:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
@@ -28,7 +29,7 @@ from experiments.algorithms import ALGORITHMS, Training
 from experiments.config import AlgorithmName, Config, command_line
 from experiments.demonstrations import start_from_demonstrations
 from experiments.files import is_new, write_whole
-from experiments.film import save_film
+from experiments.film import Policy, save_film
 from experiments.grid import side_by_side
 from experiments.log import Log, figures, progress_text, score, summed_costs, versions
 from experiments.report import plot_curves, save_picture, table
@@ -59,6 +60,7 @@ from torchrl_safe.envs import (
     Push,
     Reach,
     Scattered,
+    ShieldCorrection,
     Speed,
     SpeedAndSeparation,
     Task,
@@ -90,6 +92,7 @@ OBSERVATIONS = {"full": FullObservation(), "paper": paper_observation}
 COSTS: dict[str, Cost] = {
     "collision": Collision(),
     "contact-force": ContactForce(),
+    "correction": ShieldCorrection(),
     "joint-limit": JointLimit(),
     "proximity": Proximity(),
     "separation": SpeedAndSeparation(),
@@ -107,12 +110,13 @@ def make_env(
     algorithm: AlgorithmName = "ppo",
     *,
     training: bool = False,
+    shielded: bool = True,
     gui: bool = False,
 ) -> EnvBase:
     """Makes the environment that an algorithm trains in, with sums of reward and cost.
 
     The sums, over each episode, are of what the arm has earned and cost, whatever an algorithm
-    makes of it.
+    makes of it. ``shielded=False`` leaves out the shield that an algorithm may have, and its cost.
     """
     settings: dict[str, Any] = {
         "observation": OBSERVATIONS[config.observation],
@@ -127,8 +131,8 @@ def make_env(
     else:
         env = ArmEnv(
             physics=PHYSICS[config.physics],
-            shield=ALGORITHMS[algorithm].shield,
-            **{**arm_arguments(config), **settings},
+            shield=ALGORITHMS[algorithm].shield if shielded else None,
+            **{**arm_arguments(config, shielded), **settings},
         )
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = ALGORITHMS[algorithm].transforms(config)
@@ -137,7 +141,7 @@ def make_env(
     return TransformedEnv(env, Compose(sums, *transforms))
 
 
-def arm_arguments(config: Config) -> dict[str, Any]:
+def arm_arguments(config: Config, shielded: bool = True) -> dict[str, Any]:
     """What the arm, its task and its costs are, as arguments of ArmEnv."""
     if config.suite_task is not None:
         return SUITE[config.suite_task].arguments
@@ -147,9 +151,14 @@ def arm_arguments(config: Config) -> dict[str, Any]:
         "action": make_action(config),
         "task": task,
         "obstacles": OBSTACLES[config.obstacles],
-        "costs": {name: COSTS[name] for name in config.cost_limits},
+        "costs": {name: COSTS[name] for name in cost_names(config, shielded)},
         "max_episode_steps": steps,
     }
+
+
+def cost_names(config: Config, shielded: bool = True) -> tuple[str, ...]:
+    """Names of the costs, in their order."""
+    return tuple(name for name in config.cost_limits if shielded or name != "correction")
 
 
 def make_action(config: Config) -> ActionMode:
@@ -289,17 +298,28 @@ def train_and_evaluate(
     """Trains with one algorithm and plays with what it has learnt; returns policy and results."""
     actor, log = train(config, algorithm, progress=progress, line=line)
     seconds = log.seconds
-    env = make_env(config, num_envs=32, algorithm=algorithm)
-    # Seeds that training does not use.
-    episodes = evaluate(env, actor, config.eval_episodes, seed=config.seed + 1_000_000)
-    env.close()
-    return actor, {
+    evaluation, episodes = play(config, algorithm, actor)
+    result = {
         "versions": versions(),
         "seconds": seconds,
         "history": log.rows,
-        "evaluation": summarize(episodes, tuple(config.cost_limits)),
+        "evaluation": evaluation,
         "episodes": {name: value.tolist() for name, value in episodes.items()},
     }
+    if ALGORITHMS[algorithm].shield is not None:
+        result["without_shield"] = play(config, algorithm, actor, shielded=False)[0]
+    return actor, result
+
+
+def play(
+    config: Config, algorithm: AlgorithmName, actor: TensorDictModuleBase, *, shielded: bool = True
+) -> tuple[dict[str, list[float]], TensorDict]:
+    """Plays the final evaluation; returns its figures and episodes."""
+    env = make_env(config, num_envs=32, algorithm=algorithm, shielded=shielded)
+    # Seeds that training does not use.
+    episodes = evaluate(env, actor, config.eval_episodes, seed=config.seed + 1_000_000)
+    env.close()
+    return summarize(episodes, cost_names(config, shielded)), episodes
 
 
 def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
@@ -336,7 +356,7 @@ def result_of(config: Config, algorithm: AlgorithmName, line: int = 0) -> dict[s
 
 def film(config: Config, path: Path, *, seed: int, **options: Any) -> None:
     """Films the policies of a run side by side; ``options`` are those of :func:`save_film`."""
-    actors = {
+    actors: dict[str, tuple[EnvBase, Policy]] = {
         name: (
             make_env(config, num_envs=1, algorithm=name),
             load_policy(config.out / name / "policy.pt").actor,

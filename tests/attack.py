@@ -1,13 +1,15 @@
 """Tries to make a shielded arm touch something: `make attack ARGS="--steps 1000000"`.
 
 Prints for each arm, action, layout and kind of attack how often it succeeded. A touch is the arm's
-own doing if its closest point was moving towards the obstacle's at that moment.
+own doing if its closest point was moving towards the obstacle's at that moment. Stopped and started
+again with the same arguments, it goes on with the attacks that are missing.
 """
 
 import argparse
+import json
 import sys
 from itertools import product
-from time import perf_counter
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -62,11 +64,23 @@ class Tally:
         self.braked += int(state.shield_braked.sum())
         self.nearest = min(self.nearest, state.trace["clearance"][:, -1].min(initial=np.inf))
 
+    def figures(self):
+        """What has been counted, by name."""
+        names = ("steps", "touches", "own", "table", "braked", "nearest")
+        return {name: float(getattr(self, name)) for name in names}
+
     def __str__(self):
-        return (
-            f"{self.steps} steps, {self.touches} touches, {self.own} of its own doing, "
-            f"{self.table} of the table, {self.braked} braked, nearest {self.nearest:.4f} m"
-        )
+        return describe([self.figures()])
+
+
+def describe(figures):
+    """Some tallies in a sentence."""
+    sums = {name: sum(each[name] for each in figures) for name in figures[0]}
+    return (
+        f"{sums['steps']:.0f} steps, {sums['touches']:.0f} touches, {sums['own']:.0f} of its own "
+        f"doing, {sums['table']:.0f} of the table, {sums['braked']:.0f} braked, nearest "
+        f"{min(each['nearest'] for each in figures):.4f} m"
+    )
 
 
 def random(env, rng):
@@ -162,26 +176,36 @@ def main():
     parser.add_argument("--physics", choices=PHYSICS, default="mujoco")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--layouts", nargs="+", choices={**FIXED, **MOVING}, default=list(FIXED))
+    parser.add_argument("--out", type=Path, default=Path("runs/attack.json"), help="what is done")
     options = parser.parse_args()
     torch.set_num_threads(1)
     layouts = {**FIXED, **MOVING}
     cases = list(product(options.arms, ACTIONS, options.layouts, ATTACKS))
     each = -(-options.steps // (len(cases) * options.envs))
-    for seed, (arm, action, layout, attack) in enumerate(cases):
-        begin = perf_counter()
-        env = make(
-            ARMS[arm],
-            ACTIONS[action],
-            layouts[layout],
-            PHYSICS[options.physics],
-            options.envs,
-            seed=seed,
-        )
-        tally = play(env, ATTACKS[attack], each, seed)
-        env.close()
-        line = f"{arm} {action} {layout} {attack}: {tally}, {perf_counter() - begin:.0f} s"
-        sys.stdout.write(line + "\n")
+    done = json.loads(options.out.read_text()) if options.out.exists() else {}
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    shield = Shield()
+    names = [
+        f"{options.physics} {arm} {action} {layout} {attack}, {each} x {options.envs}, {shield}"
+        for arm, action, layout, attack in cases
+    ]
+    for seed, (name, (arm, action, layout, attack)) in enumerate(zip(names, cases, strict=True)):
+        if name not in done:
+            env = make(
+                ARMS[arm],
+                ACTIONS[action],
+                layouts[layout],
+                PHYSICS[options.physics],
+                options.envs,
+                seed=seed,
+                shield=shield,
+            )
+            done[name] = play(env, ATTACKS[attack], each, seed).figures()
+            env.close()
+            options.out.write_text(json.dumps(done, indent=1))
+        sys.stdout.write(f"{arm} {action} {layout} {attack}: {describe([done[name]])}\n")
         sys.stdout.flush()
+    sys.stdout.write(f"all: {describe([done[name] for name in names])}\n")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The shield: its distances, its projection, what it does to actions, and attacks on it."""
 
+import json
 from itertools import combinations
 
 import attack
@@ -14,8 +15,10 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 from worlds import ENGINES, Places, each_arm, step
 
+from experiments.pilots import act, make_pilot
 from torchrl_safe.envs import (
     PANDA,
+    UR5,
     ArmEnv,
     Box,
     CartesianDelta,
@@ -26,7 +29,9 @@ from torchrl_safe.envs import (
     JointDelta,
     Moving,
     NoObstacles,
+    PickAndPlace,
     Placement,
+    Push,
     Region,
     Scattered,
     Scene,
@@ -420,6 +425,54 @@ def test_no_attack_makes_it_touch_what_stands(make_env, engine, action, kind):
     tally = attack.play(env, attack.ATTACKS[kind], 25)
     assert tally.steps == 200
     assert tally.touches == tally.table == 0
+
+
+def test_what_the_next_step_needs_is_looked_at(make_env):
+    """A stretched arm along the table, joints at full speed against each other: it sank to it."""
+    env = make_env(
+        attack.make, UR5, attack.ACTIONS["cartesian"], InFront(), ENGINES["mujoco"], 32, seed=119
+    )
+    tally = attack.play(env, attack.corners, 20, seed=19)
+    assert tally.touches == tally.table == 0, str(tally)
+
+
+@pytest.mark.parametrize("task", [Push(), PickAndPlace(on_table=1.0)], ids=lambda t: str(t)[:4])
+def test_it_lets_an_arm_push_and_pick_up(make_env, task):
+    """Down to the table and beside the obstacle, to which the shield has no objection."""
+    action = CartesianDelta(
+        step=0.03,
+        orientation=PANDA.handling_orientation,
+        finger_step=0.04 if isinstance(task, PickAndPlace) else None,
+    )
+    settings = {"task": task, "action": action, "max_episode_steps": 200, "seed": 3}
+    physics = ENGINES["mujoco"]
+    env = make_env(ArmEnv, num_envs=4, physics=physics, shield=Shield(), **settings)
+    env.reset()
+    pilot, alive, success = make_pilot(env), torch.ones(4, 1, dtype=torch.bool), 0
+    while alive.any():
+        after = step(env, torch.as_tensor(act(env, pilot), dtype=torch.float32))
+        assert not (after["cost"] * alive).any()
+        success = success + (after["success"] & alive)
+        alive &= ~after["done"]
+    assert success.all()
+
+
+def test_attacks_go_on_where_they_were_stopped(tmp_path, monkeypatch, capsys):
+    out, played = tmp_path / "attack.json", []
+    play = attack.play
+    monkeypatch.setattr(attack, "play", lambda *a: played.append(a[1].__name__) or play(*a))
+    options = ["--steps", "24", "--envs", "2", "--arms", "Panda", "--layouts", "in-front"]
+    monkeypatch.setattr("sys.argv", ["attack.py", *options, "--out", str(out)])
+    attack.main()
+    assert played == [*attack.ATTACKS] * 2
+    text = capsys.readouterr().out
+    assert "all: 24 steps" in text
+    kept = json.loads(out.read_text())
+    kept.pop(next(iter(kept)))
+    out.write_text(json.dumps(kept))
+    attack.main()
+    assert played[6:] == ["random"]
+    assert capsys.readouterr().out == text
 
 
 def test_the_attacks_would_touch_it_else(make_env):

@@ -198,7 +198,7 @@ BINDING = {
     "panda-reach-in-front": {"collision": 3},
     "panda-reach-scattered": {"collision": 3},
     "ur5-reach-moving": {"collision": 3},
-    "panda-reach-human": {"separation": 3},
+    "panda-reach-human": {"separation": 1.5},
     "iiwa-reach-joints": {"collision": 3},
 }
 

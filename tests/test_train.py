@@ -155,6 +155,32 @@ def test_a_shield_is_trained_with_beside_the_others():
         env.close()
 
 
+def test_a_shield_and_its_cost_can_be_taken_away():
+    config = Config(
+        algorithms=("ppo-lagrangian-shield",), costs={"collision": 0.5, "correction": 0.2}
+    )
+    for shielded, names in ((True, ("collision", "correction")), (False, ("collision",))):
+        env = make_env(
+            config, num_envs=1, algorithm="ppo-lagrangian-shield", shielded=shielded
+        ).base_env
+        assert (env.shield is not None) == shielded
+        assert env.cost_names == names
+        env.close()
+    with pytest.raises(ValueError, match="correction with algorithms without a shield"):
+        Config(costs={"collision": 0.5, "correction": 0.2})
+    with pytest.raises(ValueError, match="another cost beside correction"):
+        Config(algorithms=("ppo-shield",), costs={"correction": 0.2})
+
+
+def test_tables_show_what_is_left_without_the_shield():
+    evaluation = {"cost/collision": [0.0, 0.0, 0.1], "cost/correction": [0.1, 0.0, 0.2]}
+    without = {"cost/collision": [3.0, 2.0, 4.0]}
+    run = {"evaluation": evaluation, "without_shield": without}
+    limits = {"collision": 0.5, "correction": 0.2}
+    lines = table({"algorithms": {"ppo-shield": run}, "cost_limits": limits}).splitlines()
+    assert lines[3] == "| ppo-shield, without its shield | 3.00 [2.00, 4.00] |  |"
+
+
 def test_costs_are_summed_over_training():
     costs = torch.tensor([[[1.0, 2.0], [0.0, 1.0]]])
     batch = TensorDict({"next": {"cost": costs}}, [1, 2])

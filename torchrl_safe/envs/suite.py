@@ -51,7 +51,7 @@ class SuiteTask:
     Examples:
         >>> task = SUITE["panda-reach-human"]
         >>> dict(task.cost_limits)
-        {'collision': 0.5, 'separation': 1.0}
+        {'collision': 0.5, 'separation': 0.5}
         >>> env = task.make_env(num_envs=2, seed=0)
         >>> env.cost_names, env.max_episode_steps
         (('collision', 'separation'), 60)
@@ -156,9 +156,7 @@ SUITE: dict[str, SuiteTask] = {
             Reach(),
             _BUSY_PERSON,
             _BESIDE_A_PERSON,
-            {"collision": 0.5, "separation": 1.0},
-            # 0.4 m/s along each axis.
-            CartesianDelta(step=0.02),
+            {"collision": 0.5, "separation": 0.5},
         ),
         SuiteTask(
             "iiwa-reach-joints",
@@ -179,6 +177,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM6),
             max_episode_steps=200,
+            frames=131_072,
         ),
         SuiteTask(
             "panda-push-human",
@@ -189,6 +188,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5, "separation": 2.0},
             _handling(PANDA),
             max_episode_steps=200,
+            frames=131_072,
         ),
         SuiteTask(
             "panda-pick-in-front",
@@ -199,6 +199,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
         SuiteTask(
             "ur10-pick-workspace",
@@ -212,6 +213,7 @@ SUITE: dict[str, SuiteTask] = {
             {"workspace": 0.5, "contact-force": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
         SuiteTask(
             "xarm7-pick-scattered",
@@ -222,6 +224,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
     )
 }

@@ -53,7 +53,12 @@ class _Pairs(NamedTuple):
     def of(self, rows: NDArray[np.int_]) -> _Pairs:
         """Those of some worlds."""
         return _Pairs(
-            *(part[rows] for part in self[:-1]), self.other
+            self.room[rows],
+            self.spare[rows],
+            self.closing[rows],
+            self.joints[rows],
+            self.fingers[rows],
+            self.other,
         )
 
 
@@ -98,8 +103,9 @@ class Shield:
     follow: a joint's velocity changes by no more than ``acceleration`` allows, or by no more than
     takes up the room that is left, whichever is more. So far from everything the shield changes
     nothing. The solver is exact; what is linear in it is checked: where the end of the step could
-    be too near, the distances there are measured too, and become inequalities of a second problem.
-    If there is no solution, the arm holds still, which the key ``shield_braked`` says.
+    be too near, the distances there are measured too, and become inequalities of a second problem,
+    in which one more step like this one, slower by b, has to be safe there as well. If there is no
+    solution, the arm holds still, which the key ``shield_braked`` says.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -109,7 +115,8 @@ class Shield:
     - ``reach`` is enough to stop in from the arm's largest speed,
     - and within a control step the arm does not turn so far that a shape comes near in its middle
       and leaves again: the distances at both ends are checked, those between follow from them to
-      within the same margin.
+      within the same margin,
+    - and there is a solution. An arm that has to hold still at full speed needs some way to do so.
 
     With obstacles that move, their velocity counts: the arm gives way as far as its joints allow.
     As their future is unknown, the guarantee is another: the arm is not the one that moves into
@@ -152,7 +159,7 @@ class Shield:
 
     margin: float = 0.01
     rate: float = 20.0
-    table: float = 0.01
+    table: float = 0.015
     reach: float = 0.3
     acceleration: float = 10.0
     obstacle_speed: float | None = None
@@ -211,6 +218,8 @@ class Shield:
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
             turned = (then.joints @ change[again][:, :, None])[:, :, 0]
             needed = _needed(step, now.of(again), then) + turned
+            # And one more step like this one, as much slower as it can be, is to be safe there.
+            needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.joints))
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             change[again], solved[again] = project(
                 asked[again],
@@ -256,12 +265,15 @@ class Shield:
     def _spare(self, step: _Step, room: Array, joints: Array) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
         share = step.share * room
-        # From one step to the next, the joints can make a distance shrink by that much less.
-        brake = self.acceleration * step.duration**2 * _SURE * np.abs(joints).sum(axis=2)
+        brake = self._brake(step, joints)
         some = np.where(np.isfinite(room), np.maximum(room, 0), 0.0)
         # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
         stops = np.sqrt(brake * (brake / 4 + 2 * some)) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
+
+    def _brake(self, step: _Step, joints: Array) -> Array:
+        """How much less distances can shrink in a step than in the one before, m, ``(k, r)``."""
+        return self.acceleration * step.duration**2 * _SURE * np.abs(joints).sum(axis=2)
 
     def _least(self, step: _Step, now: _Pairs) -> Array:
         """By how much each distance has to change at least, m, ``(N, r)``."""
