@@ -20,6 +20,8 @@ from torchrl_safe.envs.vectors import cross
 _ERROR = 0.1
 # Of what the joints hardly move, m/rad, and of joints without limits, rad.
 _SHORTEST, _FAR = 1e-3, 1e3
+# What is no distance, m.
+_TOLERANCE = 1e-9
 # Of what the joints can do to stop, the part that is counted on: others may have to turn on.
 _SURE = 1 / 3
 
@@ -214,10 +216,14 @@ class Shield:
             # And one more step like this one, as much slower as it can be, is to be safe there.
             needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.joints))
             needed = _attainable(then.joints, needed, lower[again], upper[again])
+            # What satisfies these too is the solution of both.
+            short = np.flatnonzero((turned < needed - _TOLERANCE).any(axis=1))
+            again = again[short]
+        if len(again):
             change[again], solved[again] = project(
                 asked[again],
-                np.concatenate([rows[again], then.joints], axis=1),
-                np.concatenate([least[again], needed], axis=1),
+                np.concatenate([rows[again], then.joints[short]], axis=1),
+                np.concatenate([least[again], needed[short]], axis=1),
                 lower[again],
                 upper[again],
             )
