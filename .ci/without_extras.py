@@ -19,7 +19,7 @@ from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import ArmEnv, CostToReward, EarlyTermination
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
-from torchrl_safe.policy import load_policy, save_policy
+from torchrl_safe.policy import load_policy, save_policy, shipped_policies
 from torchrl_safe.trainers import MultiplierHook
 
 
@@ -104,4 +104,8 @@ assert loss.lagrange_multiplier > 0
 assert checkpoints.load() == 1
 save_policy("policy.pt", actor, env.observation_spec_unbatched)
 assert load_policy("policy.pt")(np.zeros(2)).shape == (1,)
+assert shipped_policies()
+for name in shipped_policies():
+    shipped = load_policy(name)
+    assert shipped(np.zeros(shipped.observation_shape)).shape == shipped.action_shape
 print("Losses, rules, transforms, checkpoints and policies work without extras.")

@@ -276,19 +276,23 @@ class Config:
 
 _HANDLING = {
     "demonstrations": 98_304,
-    "frames": 196_608,
+    "frames": 131_072,
     "envs": 64,
     "frames_per_batch": 4096,
     "minibatch": 512,
     "hidden": 128,
     "learning_rate": 3e-4,
     "first_log_std": -1.7,
-    "last_log_std": -2.5,
+    "last_log_std": -3.5,
 }
 #: The kinds of task, by the names that options give them.
 TASKS: dict[str, type] = {"reach": Reach, "push": Push, "pick-and-place": PickAndPlace}
 # What differs between reaching, pushing and picking up; within a kind of task nothing does.
 KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: _HANDLING, PickAndPlace: _HANDLING}
+
+# The wide noise of make train is itself faster than a limit of the suite allows, and nearer to
+# joint limits: multipliers then rise before anything is learnt.
+_SUITE_KINDS = {**KINDS, Reach: {**KINDS[Reach], "first_log_std": -1.0}}
 
 
 #: How ``--help`` groups the options.
@@ -324,7 +328,7 @@ def suite_config(name: SuiteTaskName, **others: Any) -> Config:
     if name not in SUITE:
         raise ValueError(f"suite_task must be one of {', '.join(SUITE)}, got {name!r}.")
     task = SUITE[name]
-    chosen = {"frames": task.frames, **KINDS[type(task.task)], **others}
+    chosen = {**_SUITE_KINDS[type(task.task)], "frames": task.frames, **others}
     return Config(**{**chosen, "suite_task": name})
 
 

@@ -57,7 +57,9 @@ def start_from_demonstrations(training: Training, env: TransformedEnv, config: C
         if index == flown:
             standardize(training.loss, imitation.seen["observation"])
         imitation.learn(_TIMES * new)
-        imitation.add(stage.play(_STEPS, training.actor))
+        # Every other time without its noise: it would stop for good where it is undecided, and
+        # with noise it never gets there.
+        imitation.add(stage.play(_STEPS, training.actor, noise=bool(index % 2)))
     imitation.learn(_LAST_TIMES * rounds * new, settle=True)
     played = Stage(env).play(env.base_env.max_episode_steps, training.actor)
     fit_critics(training.loss, played, config.learning_rate)
@@ -77,16 +79,22 @@ class Stage:
         self.now = env.reset()
 
     @torch.no_grad()
-    @set_exploration_type(ExplorationType.RANDOM)
     def play(
-        self, steps: int, policy: Callable[[TensorDictBase], TensorDictBase]
+        self,
+        steps: int,
+        policy: Callable[[TensorDictBase], TensorDictBase],
+        *,
+        noise: bool = True,
     ) -> TensorDictBase:
         """Plays on, ``(worlds, steps)``; ``advice`` is what the pilot would have done."""
         played = []
-        for _ in range(steps):
-            self.now["advice"] = torch.as_tensor(act(self.arm, self.pilot), dtype=torch.float32)
-            step, self.now = self.env.step_and_maybe_reset(policy(self.now))
-            played.append(step)
+        kind = ExplorationType.RANDOM if noise else ExplorationType.DETERMINISTIC
+        with set_exploration_type(kind):
+            for _ in range(steps):
+                advice = act(self.arm, self.pilot)
+                self.now["advice"] = torch.as_tensor(advice, dtype=torch.float32)
+                step, self.now = self.env.step_and_maybe_reset(policy(self.now))
+                played.append(step)
         return torch.stack(played, dim=1)
 
 

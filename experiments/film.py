@@ -1,12 +1,13 @@
-"""Films policies side by side and in slow motion, with what they earn and cost.
+"""Films policies side by side and in slow motion, with reward, costs and limits.
 
-``make train`` does so in the end. ``python -m experiments.film_run`` films a run again.
+``make train`` films its policies. ``python -m experiments.film_run`` films those of a run again.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -43,12 +44,12 @@ _PER_ROW = 3
 
 @dataclass(frozen=True)
 class Pace:
-    """How an episode is cut into pictures.
+    """How many pictures a control step has.
 
     Attributes:
-        parts: steps of the environment in which it does what the policy asks for at once.
-        every: control steps of one picture, where there are more than can be shown.
-        repeats: times that each picture is shown, where there are fewer.
+        parts: steps of the environment in a control step of the policy, each with a picture.
+        every: control steps in one picture, if the policy acts more often than is shown.
+        repeats: how often each picture is shown, if the environment cannot be divided.
     """
 
     parts: int = 1
@@ -95,35 +96,29 @@ def save_film(
         fine: draw twice as many pictures, with shadows, and in twice the size first. Takes ten
             times as long.
     """
-    stages = [(name, *_stage(env, 1 + fine), policy) for name, (env, policy) in actors.items()]
-    for _, env, _, _ in stages:
-        env.set_seed(seed)
-    frames, durations = [], []
     camera = replace(camera, shadows=fine or camera.shadows)
     scale = _SCALE if fine else 1
     size = (width * scale, width * 3 // 4 * scale)
-    for _ in range(episodes):
-        clips = {name: film(env, policy, pace, camera, size) for name, env, pace, policy in stages}
-        for index in range(max(map(len, clips.values()))):
-            panels = [
-                _panel(
-                    name,
-                    clip[: index + 1],
-                    limits or {},
-                    width,
-                    camera,
-                    ended=index + 1 >= len(clip),
-                )
-                for name, clip in clips.items()
-            ]
-            frames.append(_in_rows(panels))
-            durations.append(_SHOWN // (1 + fine))
-        durations[-1] = _PAUSE
-        if len(frames) >= _MOST * (1 + fine):
-            break
-    for (_, env, _, _), (given, _) in zip(stages, actors.values(), strict=True):
-        if env is not given:
-            env.close()
+    frames, durations, stages = [], [], []
+    with ExitStack() as made:
+        for name, (env, policy) in actors.items():
+            stage, pace = _stage(env, 1 + fine)
+            if stage is not env:
+                made.callback(stage.close)
+            stage.set_seed(seed)
+            stages.append((name, stage, policy, pace))
+        for _ in range(episodes):
+            clips = {name: film(*stage, camera, size) for name, *stage in stages}
+            for index in range(max(map(len, clips.values()))):
+                panels = [
+                    _panel(name, clip[: index + 1], limits or {}, width, camera, len(clip))
+                    for name, clip in clips.items()
+                ]
+                frames.append(_in_rows(panels))
+                durations.append(_SHOWN // (1 + fine))
+            durations[-1] = _PAUSE
+            if len(frames) >= _MOST * (1 + fine):
+                break
     _save(frames, durations, path)
 
 
@@ -173,11 +168,11 @@ def play(
 
 
 class Divided:
-    """An action mode of which an action takes several control steps, in equal parts.
+    """An action mode whose actions take several control steps, in equal parts.
 
     Args:
-        whole: what the action does all in all.
-        parts: in how many steps. The action has to be repeated in each.
+        whole: what an action does in all parts together.
+        parts: how many. Repeat the action in each of them.
     """
 
     def __init__(self, whole: ActionMode, parts: int) -> None:
@@ -202,7 +197,7 @@ class Divided:
 def slow_motion(env: ArmEnv, parts: int) -> ArmEnv:
     """Returns an environment of one world in which a control step takes ``parts`` steps.
 
-    There is something to film in between. An action has to be repeated as often.
+    Repeat each action ``parts`` times, and film in between.
     """
     return ArmEnv(
         env.arm,
@@ -263,10 +258,12 @@ def _panel(
     limits: Mapping[str, float],
     width: int,
     camera: Camera,
-    *,
-    ended: bool,
+    length: int,
 ) -> Image.Image:
-    """Draws the last moment of a clip, with its name above and what it has cost below."""
+    """Draws the last moment of the beginning of a clip of some length.
+
+    The name of the algorithm is above, and what the episode has cost below.
+    """
     now, scale, height = clip[-1], _SCALE, width * 3 // 4
     lines = len(now.cost) + 1
     full = (width * scale, (_HEAD + height + _FOOT * lines // 2) * scale)
@@ -279,9 +276,10 @@ def _panel(
     top, bottom = _HEAD * scale, (_HEAD + height) * scale
     if any(moment.touching for moment in clip[-_GLOW:]):
         draw.rectangle((0, top, full[0] - 1, bottom - 1), outline=ALARM, width=5 * scale)
-        _badge(draw, "COLLISION", ALARM, (full[0] - 14 * scale, top + 14 * scale))
+        word = "COLLISION" if "collision" in now.cost else "CONTACT"
+        _badge(draw, word, ALARM, (full[0] - 14 * scale, top + 14 * scale))
     above = any(cost > limits.get(key, math.inf) for key, cost in now.cost.items())
-    if ended:
+    if len(clip) == length:
         reached = "target reached" if now.success else "target missed"
         verdict = f"{reached}, over the limit" if above else reached
         good = now.success and not above

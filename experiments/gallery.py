@@ -1,4 +1,4 @@
-"""Draws six environments, with what is in them named: ``make gallery``."""
+"""Draws environments, with what is in them named: ``make gallery``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ from torchrl_safe.envs.gym import combination
 
 #: From the side, so that neither the arm nor the person hides the table.
 CAMERA = Camera(eye=(0.55, -1.5, 0.8), target=(0.47, 0.0, 0.23), field_of_view=35, shadows=True)
-#: The same with room for a person.
+#: From the other end of the table: cube and goal are beside each other as the robot sees them.
+ACROSS = Camera(eye=(1.55, -0.85, 0.8), target=(0.42, 0.0, 0.18), field_of_view=38, shadows=True)
+#: From the side, with room for a person.
 WITH_PERSON = Camera(
     eye=(0.75, -1.8, 0.9), target=(0.66, 0.0, 0.27), field_of_view=40, shadows=True
 )
@@ -31,23 +33,29 @@ WITH_PERSON = Camera(
 #: seed with which nothing hides anything.
 SCENES = (
     ("Panda", "Reach", "InFront", 0),
-    ("Iiwa", "Push", "Scattered", 0),
-    ("XArm7", "PickAndPlace", "InFront", 15),
+    ("Iiwa", "Push", "Scattered", 20),
+    ("XArm7", "PickAndPlace", "InFront", 9),
     ("UR5", "Reach", "Human", 3),
-    ("XArm6", "Push", "Moving", 0),
+    ("XArm6", "Push", "Moving", 9),
     ("UR10", "PickAndPlace", "Human", 1),
 )
+#: The pictures of the pages of the tasks, by their file names.
+TASK_SCENES = {
+    "reach": ("Panda", "Reach", "InFront", 22),
+    "push": ("Panda", "Push", "InFront", 15),
+    "pick_and_place": ("Panda", "PickAndPlace", "InFront", 15),
+}
 _COLUMNS = 3
 
 
 @dataclass(frozen=True)
 class Config:
-    """Draw six environments."""
+    """Draw six environments, and each task."""
 
     physics: Engine = "mujoco"
     """Engine that simulates and draws them."""
     out: Path = Path("runs/gallery.png")
-    """File of the picture."""
+    """File of the six; the pictures of the tasks are put beside it."""
     width: int = 420
     """Width of each tile in pixels; its height is three quarters of that."""
     steps: int = 14
@@ -55,7 +63,8 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Draws and saves the pictures."""
+    """Draws and saves the gallery, and beside it the pictures of the tasks."""
+    config.out.parent.mkdir(parents=True, exist_ok=True)
     size = (config.width, config.width * 3 // 4)
     rows = -(-len(SCENES) // _COLUMNS)
     with figure_style():
@@ -68,9 +77,14 @@ def main(config: Config) -> None:
         scenes = tqdm(SCENES, desc="gallery", unit="picture")
         for axis, (*parts, seed) in zip(grid.flat, scenes, strict=True):
             draw(axis, parts, seed, config, size)
-        config.out.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(config.out, dpi=100)
         plt.close(figure)
+        for name, (*parts, seed) in TASK_SCENES.items():
+            figure, axis = plt.subplots(figsize=(size[0] / 75, size[1] / 75), layout="constrained")
+            draw(axis, parts, seed, config, size)
+            axis.set_title("")
+            figure.savefig(config.out.with_name(f"{name}.png"), dpi=100)
+            plt.close(figure)
 
 
 def draw(
@@ -82,7 +96,10 @@ def draw(
         **combination(arm, task, obstacles, ""), physics=PHYSICS[config.physics], seed=seed
     )
     env.rollout(config.steps, lambda td: td.set("action", env.action_spec.zero()))
-    camera = WITH_PERSON if isinstance(env.obstacles, Human) else CAMERA
+    if isinstance(env.obstacles, Human):
+        camera = WITH_PERSON
+    else:
+        camera = ACROSS if env.task.objects else CAMERA
     twice = (2 * size[0], 2 * size[1])
     axis.imshow(env.render(*twice, camera)[0].numpy(), extent=(0, size[0], size[1], 0))
     things = names(env.arm_state, env)

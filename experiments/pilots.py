@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from torchrl_safe.envs import (
+    PANDA,
     ArmEnv,
     ArmState,
     CartesianDelta,
@@ -21,7 +22,6 @@ from torchrl_safe.envs import (
     PickAndPlace,
     Push,
     Reach,
-    Task,
 )
 from torchrl_safe.envs.state import Array
 
@@ -29,6 +29,12 @@ from torchrl_safe.envs.state import Array
 _LOW = 0.033
 # How far above the obstacles, and without any above the table, the tool goes over to the object.
 _OVER, _ABOVE_TABLE = 0.13, 0.12
+# How far the tool goes in a control step beside what moves, m. How far off that is to be, or the
+# tool goes back, m; where that is not much, it slows down, m. What comes nearer counts as where it
+# will be in some time, s.
+_PACE, _ROOM, _SLOWER, _TIME = 0.027, 0.11, 0.1, 0.5
+# What of the hand is to be out of the way: heights above the tool point, and half its width, m.
+_HAND, _HALF_WIDTH = (0.0, 0.1, 0.2), 0.07
 # Share of the largest action: a policy that squashes its output can give it.
 _SHARE = 0.9
 
@@ -43,9 +49,11 @@ class Pilot(Protocol):
 def act(env: ArmEnv, pilot: Pilot) -> Array:
     """Returns the actions of a pilot in the present state, ``(N, width)``."""
     target, opening = pilot(env.arm_state)
-    move = (target - env.arm_state.ee_position) / env.action_mode.step
+    mode = env.action_mode
+    assert isinstance(mode, CartesianDelta)  # Or there would be no pilot.
+    move = (target - env.arm_state.ee_position) / mode.step
     move *= _SHARE / np.maximum(_SHARE, np.abs(move).max(1, keepdims=True))
-    if not env.action_mode.moves_fingers:
+    if not mode.moves_fingers:
         return move
     return np.column_stack([move, _SHARE * (2 * opening - 1)])
 
@@ -61,13 +69,7 @@ class ReachPilot:
 
 @dataclass(frozen=True)
 class PickAndPlacePilot:
-    """From above to the object, over everything to the goal, and down.
-
-    Args:
-        slack: how much too low the object still may be when it is carried sideways, m.
-    """
-
-    slack: float = 0.0
+    """From above to the object, over everything to the goal, and down."""
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
         tool, place = state.ee_position, state.object_position[:, 0]
@@ -79,7 +81,7 @@ class PickAndPlacePilot:
         pick = _from_above(
             tool, np.column_stack([place[:, :2], np.maximum(_LOW, place[:, 2])]), top
         )
-        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]), self.slack)
+        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]))
         target = np.where(held[:, None], put, pick)
         return target, np.where(held | near, 0.0, 1.0)
 
@@ -91,6 +93,7 @@ class PushPilot:
     Args:
         room: half axes of the ellipse around each obstacle that the object stays out of, m, along
             x, where the hand is wide, and y.
+        speed: how far it is pushed in a control step, m.
     """
 
     room: tuple[float, float] = (0.22, 0.15)
@@ -118,7 +121,7 @@ class PushPilot:
         ring = place[:, :2] + 0.065 * np.column_stack([np.cos(direction), np.sin(direction)])
         # Pushing where it has gone pushes it back to the line.
         across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-        forward = self.speed * np.clip(1 - (angle / 0.4) ** 2, 0, 1)[:, None]
+        forward = self.speed * np.clip(1 - np.abs(angle) / 0.6, 0.2, 1)[:, None]
         push = tool[:, :2] + forward * ahead - side[:, None] * across
         straight = (np.abs(angle) < 0.5)[:, None]
         flat = np.where(straight, push, ring)
@@ -149,46 +152,73 @@ class PushPilot:
         return np.where(blocked[:, None], detour, course)
 
 
-PILOTS: dict[type[Task], Pilot] = {
-    Reach: ReachPilot(),
-    Push: PushPilot(),
-    PickAndPlace: PickAndPlacePilot(),
-}
-
-
 def make_pilot(env: ArmEnv) -> Pilot:
     """Makes the pilot of an environment's task.
 
-    It looks at what stands in the way, not at what moves: where that will be it cannot know, and
-    costs are to teach it to a policy.
+    What stands, it goes round or over; from what moves, it steps back.
 
     Raises:
         ValueError: if the task has none, or its actions do not move the tool.
     """
     if not isinstance(env.action_mode, CartesianDelta):
         raise ValueError(f"demonstrations need Cartesian actions, got {env.action_mode}.")
-    for task, pilot in PILOTS.items():
-        if isinstance(env.task, task):
-            return _blind(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
-    raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
+    # A Panda's own hand is wider than the gripper of the others, whose elbows fold less.
+    room = (0.27, 0.15) if env.arm == PANDA else (0.22, 0.15)
+    pilots: dict[type, Pilot] = {
+        Reach: ReachPilot(),
+        Push: PushPilot(room),
+        PickAndPlace: PickAndPlacePilot(),
+    }
+    if type(env.task) not in pilots:
+        raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
+    pilot = pilots[type(env.task)]
+    return _stepping_back(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
 
 
-def _blind(pilot: Pilot) -> Pilot:
-    """The pilot where no obstacles are."""
+def _stepping_back(pilot: Pilot) -> Pilot:
+    """The pilot where nothing stands, which gets out of the way of what moves."""
 
     def fly(state: ArmState) -> tuple[Array, Array]:
         nothing = np.zeros_like(state.obstacle_present)
-        return pilot(replace(state, obstacle_present=nothing))
+        target, opening = pilot(replace(state, obstacle_present=nothing))
+        room, away = _room(state)
+        step = target - state.ee_position
+        step *= np.minimum(1, _PACE / np.maximum(_length(step), 1e-9))[:, None]
+        ahead, back = np.clip(room / _SLOWER, 0, 1), np.clip(-room / _SLOWER, 0, 1)
+        step = ahead[:, None] * step + back[:, None] * _PACE * away
+        return state.ee_position + step, opening
 
     return fly
 
 
-def _from_above(tool: Array, place: Array, top: Array, slack: float = 0.0) -> Array:
+def _room(state: ArmState) -> tuple[Array, Array]:
+    """How much further off than it is to be all is that moves, m, and the way away from it."""
+    points = state.ee_position[:, None] + np.array([[0, 0, height] for height in _HAND])
+    points = points[:, :, None]
+    half = state.obstacle_size[:, 2] - state.obstacle_size[:, 0]
+    x, y, z, w = np.moveaxis(state.obstacle_orientation, -1, 0)
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+    off = points - state.obstacle_position[:, None]
+    along = np.clip((off * axis[:, None]).sum(-1), -half, half)[..., None] * axis[:, None]
+    velocity = state.obstacle_velocity[:, None] + np.cross(
+        state.obstacle_angular_velocity[:, None], along
+    )
+    way = off - along
+    gap = _length(way) - state.obstacle_size[:, 0] - _HALF_WIDTH
+    coming = np.maximum(0, (velocity * _unit(way)).sum(-1))
+    room = np.where(state.obstacle_present[:, None], gap - _TIME * coming - _ROOM, np.inf)
+    room = room.reshape(len(room), -1)
+    nearest = room.argmin(1)
+    away = way.reshape(len(room), -1, 3)[np.arange(len(room)), nearest] * (1, 1, 0)
+    return room.min(1), _unit(_unit(away) + np.array([-1.0, 0, 0]))
+
+
+def _from_above(tool: Array, place: Array, top: Array) -> Array:
     """The next stop on the way up, over and down to a place."""
     off = _length(tool[:, :2] - place[:, :2])
     floor = np.minimum(top, place[:, 2] + 5 * np.maximum(0, off - 0.012))
     # Sideways only as far as it is high enough.
-    free = np.clip(1 - (floor - tool[:, 2] - slack) / 0.05, 0, 1)[:, None]
+    free = np.clip(1 - (floor - tool[:, 2]) / 0.05, 0, 1)[:, None]
     flat = tool[:, :2] + free * (place - tool)[:, :2]
     return np.column_stack([flat, floor])
 

@@ -23,7 +23,7 @@ from experiments.config import (
     SuiteTaskName,
     suite_config,
 )
-from experiments.gallery import CAMERA
+from experiments.gallery import WITH_PERSON
 from experiments.grid import run_grid, save_results
 from experiments.suite_report import plot_profiles, plot_training, report
 from torchrl_safe.envs import SUITE
@@ -103,7 +103,7 @@ def draw_scenes(config: Config) -> None:
         physics = train.PHYSICS[config.physics]
         env = SUITE[name].make_env(physics=physics, seed=1)
         env.rollout(10, lambda td: td.set("action", env.action_spec.zero()))  # noqa: B023
-        plt.imsave(pictures / f"{name}.png", env.render(480, 360, CAMERA)[0].numpy())
+        plt.imsave(pictures / f"{name}.png", env.render(480, 360, WITH_PERSON)[0].numpy())
         env.close()
 
 

@@ -9,30 +9,24 @@ limit is kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from experiments.style import colour, figure_style, label, limit_line
 from torchrl_safe.metrics import Estimate, interquartile_mean, mean
 
 Run = Mapping[str, Any]
 Limits = Mapping[str, Mapping[str, float]]
 
-# Okabe & Ito's colours, which the colour-blind tell apart; the same for an algorithm everywhere.
-_PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _DRAWS = 2000
-
-
-def colours(algorithms: Iterable[str]) -> dict[str, str]:
-    """A colour for each algorithm; PPO and PPO-Lagrangian have the same in every figure."""
-    rest = [name for name in algorithms if name not in ("ppo", "ppo-lagrangian")]
-    names = ["ppo", "ppo-lagrangian", *rest]
-    return {name: _PALETTE[index % len(_PALETTE)] for index, name in enumerate(names)}
 
 
 def report(runs: Sequence[Run], limits: Limits) -> str:
@@ -103,7 +97,7 @@ def whole(runs: Sequence[Run], limits: Limits) -> str:
         "| tasks with a limit exceeded three times | cost while training / PPO's |",
         "|---" * 6 + "|",
     ]
-    algorithms = [*dict.fromkeys(run["algorithm"] for run in runs)]
+    algorithms = _algorithms(runs)
     for algorithm in algorithms:
         success, excess = scores(runs, limits, algorithm)
         middle, high = (_interval(interquartile_mean, score) for score in (success, excess))
@@ -169,32 +163,24 @@ def profile(
 
 def plot_profiles(runs: Sequence[Run], limits: Limits, path: Path) -> None:
     """Draws the performance profiles of success and of the largest cost."""
-    figure, axes = plt.subplots(1, 2, figsize=(9.6, 3.8))
-    algorithms = [*dict.fromkeys(run["algorithm"] for run in runs)]
-    success, excess = np.linspace(0, 1, 101), np.geomspace(0.01, 100, 121)
-    for algorithm, colour in colours(algorithms).items():
-        if algorithm not in algorithms:
-            continue
-        of_runs = scores(runs, limits, algorithm)
-        for axis, score, thresholds in zip(axes, of_runs, (success, excess), strict=True):
-            share, band = profile(score.numpy(), thresholds)
-            axis.step(thresholds, share, color=colour, where="post")
-            axis.fill_between(thresholds, *band, color=colour, alpha=0.2, step="post", lw=0)
-            # Where the curve is half-way down, at its right.
-            half = int(np.argmax(share <= max(share.max() / 2, 1e-9)))
-            axis.annotate(
-                f" {algorithm}",
-                (thresholds[half], share[half]),
-                xytext=(4, 6),
-                textcoords="offset points",
-                color=colour,
-                ha="left" if axis is axes[1] else "right",
+    with figure_style():
+        figure, axes = plt.subplots(1, 2, figsize=(9.6, 3.8))
+        of_success, of_cost = np.linspace(0, 1, 101), np.geomspace(0.01, 100, 121)
+        for row, algorithm in enumerate(_algorithms(runs)):
+            of_runs = scores(runs, limits, algorithm)
+            for axis, score, thresholds in zip(axes, of_runs, (of_success, of_cost), strict=True):
+                share, band = profile(score.numpy(), thresholds)
+                drawn = {"color": colour(algorithm), "step": "post"}
+                axis.fill_between(thresholds, *band, alpha=0.2, lw=0, **drawn)
+                axis.step(thresholds, share, color=colour(algorithm), where="post")
+            # One below the other, where the curves of success are highest.
+            axes[0].annotate(
+                label(algorithm), (0.03, 0.06 + 0.07 * row), color=colour(algorithm), weight="bold"
             )
-    axes[1].axvline(1, color="black", ls="--", lw=1)
-    axes[1].annotate("limit ", (1, 1.02), ha="right", va="bottom", annotation_clip=False)
-    axes[0].set(xlabel="success", ylabel="share of runs with more", ylim=(-0.02, 1.02))
-    axes[1].set(xlabel="largest cost / limit", xscale="log", ylim=(-0.02, 1.02))
-    _save(figure, axes, path)
+        axes[0].set(xlabel="success", ylabel="share of runs with more", ylim=(-0.02, 1.04))
+        axes[1].set(xlabel="largest cost / limit", xscale="log", ylim=(-0.02, 1.04))
+        limit_line(axes[1], 1, vertical=True)
+        _save(figure, path)
 
 
 def plot_training(runs: Sequence[Run], limits: Limits, path: Path) -> None:
@@ -202,46 +188,46 @@ def plot_training(runs: Sequence[Run], limits: Limits, path: Path) -> None:
     panels = [(task, name) for task in _tasks(runs) for name in limits[task]]
     columns = min(4, len(panels))
     rows = -(-len(panels) // columns)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=(3.1 * columns, 2.5 * rows), squeeze=False, sharex=False
+    with figure_style():
+        size = (3.1 * columns, 2.4 * rows)
+        figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False)
+        for axis, (task, name) in zip(grid.flat, panels, strict=False):
+            for algorithm in _algorithms(runs):
+                _plot_sums(axis, _select(runs, task, algorithm), name, algorithm)
+            axis.set_title(f"{task}\n{name}", fontsize=8)
+            axis.set_ylim(bottom=0)
+        for axis in grid.flat[len(panels) :]:
+            axis.set_visible(False)
+        figure.supxlabel("thousand control steps of training", fontsize=9)
+        figure.supylabel("cost so far", fontsize=9)
+        _save(figure, path)
+
+
+def _plot_sums(axis: Axes, runs: Sequence[Run], name: str, algorithm: str) -> None:
+    """Mean over seeds and its range, with the algorithm's name at the end."""
+    frames = np.array([row["frames"] for row in runs[0]["history"]]) / 1000
+    sums = np.array([[row[f"summed/{name}"] for row in run["history"]] for run in runs])
+    axis.plot(frames, sums.mean(0), color=colour(algorithm))
+    axis.fill_between(frames, sums.min(0), sums.max(0), color=colour(algorithm), alpha=0.2, lw=0)
+    axis.annotate(
+        label(algorithm),
+        (frames[-1], sums.mean(0)[-1]),
+        xytext=(-2, 3),
+        textcoords="offset points",
+        ha="right",
+        color=colour(algorithm),
+        fontsize=7,
     )
-    axes = list(grid.flat)
-    algorithms = [*dict.fromkeys(run["algorithm"] for run in runs)]
-    for axis, (task, name) in zip(axes, panels, strict=False):
-        for algorithm, colour in colours(algorithms).items():
-            if algorithm not in algorithms:
-                continue
-            mine = _select(runs, task, algorithm)
-            frames = np.array([row["frames"] for row in mine[0]["history"]]) / 1000
-            sums = np.array([[row[f"summed/{name}"] for row in run["history"]] for run in mine])
-            axis.plot(frames, sums.mean(0), color=colour)
-            axis.fill_between(frames, sums.min(0), sums.max(0), color=colour, alpha=0.2, lw=0)
-            axis.annotate(
-                algorithm,
-                (frames[-1], sums.mean(0)[-1]),
-                xytext=(-2, 3),
-                textcoords="offset points",
-                ha="right",
-                color=colour,
-                fontsize=7,
-            )
-        axis.set_title(f"{task}\n{name}", fontsize=8)
-        axis.set_ylim(bottom=0)
-        axis.tick_params(labelsize=7)
-    for axis in axes[len(panels) :]:
-        axis.set_visible(False)
-    figure.supxlabel("thousand control steps of training", fontsize=9)
-    figure.supylabel("cost so far", fontsize=9)
-    _save(figure, axes, path)
 
 
-def _save(figure: Any, axes: Iterable[Any], path: Path) -> None:
-    for axis in axes:
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
+def _save(figure: Figure, path: Path) -> None:
     figure.tight_layout()
-    figure.savefig(path, dpi=120)
+    figure.savefig(path)
     plt.close(figure)
+
+
+def _algorithms(runs: Sequence[Run]) -> list[str]:
+    return [*dict.fromkeys(run["algorithm"] for run in runs)]
 
 
 def _tasks(runs: Sequence[Run]) -> list[str]:
@@ -249,8 +235,7 @@ def _tasks(runs: Sequence[Run]) -> list[str]:
 
 
 def _cells(runs: Sequence[Run]) -> list[tuple[str, str]]:
-    algorithms = dict.fromkeys(run["algorithm"] for run in runs)
-    return [(task, algorithm) for task in _tasks(runs) for algorithm in algorithms]
+    return [(task, algorithm) for task in _tasks(runs) for algorithm in _algorithms(runs)]
 
 
 def _select(runs: Sequence[Run], task: str, algorithm: str) -> list[Run]:

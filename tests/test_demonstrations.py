@@ -14,6 +14,7 @@ from experiments.demonstrations import (
     standardize,
     start_from_demonstrations,
 )
+from experiments.learners import OnPolicyLearner
 from experiments.train import make_env, train, train_and_evaluate
 
 SMALL = {
@@ -107,7 +108,7 @@ def test_critics_are_fitted_and_the_policy_stays():
 def test_every_algorithm_starts_from_the_same_policy():
     weights = []
     for algorithm in ("ppo-lagrangian", "cpo"):
-        training, env, config = make_training(algorithm)
+        training, env, config = make_training(algorithm, episode_steps=20)
         start_from_demonstrations(training, env, config)
         env.close()
         weights.append(training.actor.state_dict())
@@ -130,7 +131,8 @@ def test_acting_is_random_and_goes_on():
 
 def test_a_run_that_goes_on_is_the_run_that_was_not_stopped(tmp_path):
     """It does not begin with demonstrations again."""
-    settings = {**SMALL, "frames": 192, "frames_per_batch": 64, "epochs": 1, "checkpoint_every": 1}
+    short = {"frames": 128, "frames_per_batch": 64, "epochs": 1, "episode_steps": 20}
+    settings = {**SMALL, **short, "checkpoint_every": 1}
     whole, part = tmp_path / "whole", tmp_path / "part"
     expected = train(Config(**settings, out=whole), "ppo", progress=False)
     train(Config(**settings, out=part), "ppo", progress=False)
@@ -138,6 +140,23 @@ def test_a_run_that_goes_on_is_the_run_that_was_not_stopped(tmp_path):
         last.unlink()
     resumed = train(Config(**settings, out=part, resume=True), "ppo", progress=False)
     assert_same_run(expected, resumed, whole, part)
+
+
+@pytest.mark.slow
+def test_workers_collect_with_the_policy_that_was_taught(tmp_path, monkeypatch):
+    calm = {"first_log_std": -6.0, "last_log_std": -6.0, "learning_rate": 1e-9}
+    short = {"frames": 64, "frames_per_batch": 64, "epochs": 1, "episode_steps": 20}
+    config = Config(**SMALL, **calm, **short, workers=2, out=tmp_path)
+    before = []
+    learn = OnPolicyLearner.learn
+    monkeypatch.setattr(
+        OnPolicyLearner, "learn", lambda self, batch: (before.append(batch), learn(self, batch))
+    )
+    actor, _ = train(config, "ppo", progress=False)
+    (batch,) = before
+    chosen = actor.get_dist(batch).deterministic_sample
+    assert batch["action"].abs().max() > 0.5
+    torch.testing.assert_close(batch["action"], chosen, rtol=0, atol=0.05)
 
 
 def test_settings_of_a_task_are_those_of_its_kind():

@@ -181,11 +181,31 @@ def test_any_environment(tmp_path):
 def test_environments(tmp_path):
     """Each block runs by itself, and each environment in it is one."""
     blocks = code_of("docs/environments.md") + code_of("docs/engines.md")
-    assert len(blocks) == 8
+    assert len(blocks) == 7
     script = tmp_path / "environments.py"
     check = "env.reset()\nenv.close()\n"
     script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")
     run(script)
+
+
+def test_pages_of_tasks():
+    """Their environments, of which they tell the widths of the observations."""
+    pages = sorted((ROOT / "docs" / "tasks").glob("*.md"))
+    for page in pages:
+        (block,) = code_of(page)
+        names = {}
+        exec(block, names)
+        width = names["env"].observation_spec["observation"].shape[-1]
+        assert f"{width} numbers" in page.read_text(encoding="utf-8")
+        names["env"].rollout(2)
+        names["env"].close()
+    assert len(pages) == 3
+
+
+def test_an_observation_of_ones_own(tmp_path):
+    (block,) = code_of("docs/howto/observation.md")
+    (script := tmp_path / "observation.py").write_text(f"{block}env.close()\n", encoding="utf-8")
+    assert run(script).endswith("14 slice(13, 14, None)\n")
 
 
 def test_shield(tmp_path):
@@ -194,9 +214,9 @@ def test_shield(tmp_path):
 
 
 def test_the_circle_is_followed():
-    """What environments.md shows as a task: going where the target is keeps the tool at it."""
+    """What howto/task.md shows as a task: going where the target is keeps the tool at it."""
     names = {"__name__": __name__}
-    exec(code_of("docs/environments.md")[0], names)
+    exec(*code_of("docs/howto/task.md"), names)
     names["env"].close()
     env = ArmEnv(
         task=names["task"], observation=names["observation"], obstacles=NoObstacles(), seed=0

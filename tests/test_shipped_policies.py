@@ -132,7 +132,7 @@ def test_what_is_shipped(tmp_path, capsys):
     for weight, own in zip(saved.weights.values(), actor.state_dict().values(), strict=True):
         assert torch.equal(weight, own)
     card = json.loads((tmp_path / "policies" / f"{NAME}.json").read_text())
-    assert card["cost_limits"] == {"collision": 0.5, "separation": 0.5}
+    assert card["cost_limits"] == SUITE[NAME].cost_limits
     assert card["episodes"] == 32
     assert "--seeds 7" in card["trained"]
     assert {"success", "cost/separation", "worst/collision", "versions"} <= set(card)

@@ -167,7 +167,7 @@ def test_success_costs_nothing(make_env, name, careful, share):
 
 
 def gentle(steps):
-    """Back and up from home for some steps, then to the goal, the last 0.2 m at 0.4 m/s."""
+    """Back and up from home for some steps, then to the goal, the last 0.2 m more slowly."""
 
     def pilot(env, row):
         away = env.arm_state.ee_position[row] + [-0.1, 0, 0.25]
@@ -177,7 +177,7 @@ def gentle(steps):
             tool = env.arm_state.ee_position[row]
             way = env.arm_state.goal[row] - tool
             near = np.linalg.norm(way) < 0.2
-            yield tool + way * min(1, 0.02 / np.abs(way).max() if near else 1), 0.0
+            yield tool + way * min(1, 0.015 / np.abs(way).max() if near else 1), 0.0
 
     return pilot
 
@@ -198,7 +198,7 @@ BINDING = {
     "panda-reach-in-front": {"collision": 3},
     "panda-reach-scattered": {"collision": 3},
     "ur5-reach-moving": {"collision": 3},
-    "panda-reach-human": {"separation": 3},
+    "panda-reach-human": {"separation": 1.5},
     "iiwa-reach-joints": {"collision": 3},
 }
 

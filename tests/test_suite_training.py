@@ -14,7 +14,6 @@ from experiments.grid import missing
 from experiments.log import score
 from experiments.report import figures_table
 from experiments.suite_report import (
-    colours,
     plot_profiles,
     plot_training,
     profile,
@@ -61,7 +60,7 @@ def test_its_policy_is_evaluated_in_its_task(trained, capsys):
     _, file = trained
     config = evaluate.Config(file, episodes=4, envs=4)
     saved = load_policy(file)
-    assert evaluate.cost_limits(config, saved) == (0.5, 0.5)
+    assert evaluate.cost_limits(config, saved) == tuple(SUITE[NAME].cost_limits.values())
     env = evaluate.factory(config, saved)(num_envs=1)
     assert isinstance(env.base_env.obstacles, Human)
     assert isinstance(env.base_env.costs["separation"], SpeedAndSeparation)
@@ -70,7 +69,8 @@ def test_its_policy_is_evaluated_in_its_task(trained, capsys):
     shown = capsys.readouterr().out
     for heading in ("episode cost: separation", "episodes above the limit of collision"):
         assert heading in shown
-    assert "Cost limits collision 0.5, separation 0.5; brackets" in shown
+    limits = SUITE[NAME].cost_limits
+    assert f"Cost limits collision 0.5, separation {limits['separation']:g}; brackets" in shown
 
 
 def test_costs_are_chosen_each_with_a_limit():
@@ -97,7 +97,7 @@ def test_every_limit_is_a_budget(algorithm):
     config = suite_config(NAME, physics="mujoco")
     env = train.make_env(config, num_envs=1, algorithm=algorithm, training=True)
     (transform,) = (each for each in env.transform if hasattr(each, "budget"))
-    assert transform.budget.tolist() == [0.5, 0.5]
+    assert transform.budget.tolist() == [*SUITE[NAME].cost_limits.values()]
     env.close()
 
 
@@ -242,12 +242,6 @@ def test_figures_are_drawn(tmp_path):
         plot(RUNS, LIMITS, tmp_path / "figure.png")
         with Image.open(tmp_path / "figure.png") as image:
             assert image.width > 500
-
-
-def test_an_algorithm_has_one_colour_everywhere():
-    few, many = colours(["ppo-lagrangian"]), colours(["cpo", "ppo", "focops"])
-    assert few["ppo-lagrangian"] == many["ppo-lagrangian"]
-    assert len(set(many.values())) == len(many) == 4
 
 
 def test_jobs_are_what_make_train_runs(tmp_path):

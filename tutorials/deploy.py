@@ -131,7 +131,7 @@ print(policy(np.zeros(policy.observation_shape)))
 # An observation that is not usable raises an error, instead of moving the arm:
 
 try:
-    policy(np.full(policy.observation_shape, np.nan))
+    policy(np.zeros(39))
 except ValueError as error:
     print(error)
 

@@ -200,7 +200,7 @@ for name, (actor, _) in runs.items():
 # longest. The policies were trained in MuJoCo. They play in PyBullet here, whose pictures need no
 # screen: actions, costs and seeds mean the same in both engines.
 
-CAMERA = Camera(eye=(0.75, -0.75, 0.4), target=(0.5, 0.0, 0.15))
+CAMERA = Camera(eye=(0.8, -0.8, 0.45), target=(0.5, 0.0, 0.2))
 
 
 @torch.no_grad()

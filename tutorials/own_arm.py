@@ -157,7 +157,7 @@ except ValueError as error:
 # Look at it
 # ----------
 #
-# ``render`` draws every world. The tool points down, the elbow is up, and the red obstacle stands
+# ``render`` draws every world. The tool points down, the elbow is up, and the obstacle stands
 # between tool and target.
 
 env = ArmEnv(arm, num_envs=2, seed=0)

@@ -181,8 +181,8 @@ for key, value in loss(batch.reshape(-1)[:256]).items():
 #
 # The same for every batch, some passes over each. Two lines make it robust. A learning rate that
 # falls to 0 lets the policy settle. The gradient of the policy is clipped, and
-# ``error_if_nonfinite`` stops the run at the first NaN, before it is in your weights. Clip the
-# policy alone: gradients of critics are larger, and would leave nothing of its own.
+# ``error_if_nonfinite`` stops the run before a NaN is in its weights. Clip the policy alone: the
+# gradients of the critics are larger, and would leave nothing of its own.
 
 optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
 schedule = torch.optim.lr_scheduler.LinearLR(

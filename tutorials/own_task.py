@@ -238,7 +238,7 @@ for (name, actor), colour in zip(actors.items(), ("tab:orange", "tab:blue"), str
     axis.plot(*path[40:].T, color=colour, label=f"{name}: cost {cost:.1f}")
 axis.set(xlabel="x from the centre, m", ylabel="y from the centre, m", xlim=(-0.15, 0.15))
 axis.set(ylim=(-0.2, 0.15), aspect="equal", title="The limit keeps the tool out of the red area")
-axis.legend(loc="lower center", ncols=3, columnspacing=1, handlelength=1)
+axis.legend(loc="lower center", ncols=3, columnspacing=1, handlelength=1, fontsize=9)
 figure.tight_layout()
 
 # %%

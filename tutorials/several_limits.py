@@ -178,8 +178,8 @@ for name, (actor, _) in runs.items():
 # Look at it
 # ----------
 #
-# The paths of the tool in sixteen worlds, from the side and from above. With one limit it goes over
-# the obstacle. With two it stays below the ceiling and goes round.
+# The paths of the tool in sixteen worlds, from the side and from above. With one limit it goes
+# over the obstacle. With two it stays below the ceiling and goes round.
 
 
 @torch.no_grad()
@@ -211,8 +211,8 @@ figure.tight_layout()
 # Where to go from here
 # ---------------------
 #
-# - Lower the ceiling to 0.21 m, or add ``"speed": Speed(limit=1.0)``. Two limits that exclude each other
-#   cannot both be kept: both multipliers then stay at their bound of 10.
+# - Lower the ceiling to 0.21 m, or add ``"speed": Speed(limit=1.0)``. Two limits that exclude
+#   each other cannot both be kept: both multipliers then stay at their bound of 10.
 # - Train longer: ``FRAMES = 128_000``.
 # - Logs by name in TensorBoard: `Keep several limits at once <../howto/several_limits.html>`_.
 # - `The multiplier explodes <../howto/multiplier_explodes.html>`_.

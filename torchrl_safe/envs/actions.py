@@ -17,7 +17,7 @@ from torchrl_safe.envs.state import ArmState, Array
 
 @runtime_checkable
 class ActionMode(Protocol):
-    """What :class:`~torchrl_safe.envs.ArmEnv` asks of an action representation.
+    """Protocol of an action mode: turns actions into targets of joints and fingers.
 
     The motors' targets move evenly over the substeps of the control step, from where the joints
     are to what :meth:`targets` returns. The joints are there at its end, where their efforts and

@@ -41,21 +41,21 @@ _PHYSICS = "physics."
 class ArmEnv(EnvBase):
     """A robot arm that has a task to do and costs to keep low.
 
-    Natively batched: every row is a world of its own, all in this process. What can be chosen is
-    passed as an object: any arm with any action, task, obstacles, costs and physics.
+    The environment is batched: each of its N rows is a world of its own, and all of them run in
+    this process. You can combine any arm with any action, task, obstacles, costs and physics.
 
-    The keys, for N worlds and k costs: ``observation`` (N, width), ``action`` (N, width), and
-    under ``"next"`` also ``reward`` (N, 1), ``cost`` (N, k), ``success`` (N, 1), ``terminated``
-    (N, 1; the task is done), ``truncated`` (N, 1; the time is up) and ``done`` (N, 1).
-    ``cost`` stands in the reward spec, so that
-    ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])`` sums both. With a shield
-    there are also ``shield_correction`` (N, 1; by how much it has changed the joint targets, rad)
-    and ``shield_braked`` (N, 1; whether it held the arm still).
+    For N worlds and k costs it writes ``observation`` (N, width) and reads ``action`` (N, width).
+    Under ``"next"`` it also writes ``reward`` (N, 1), ``cost`` (N, k), ``success`` (N, 1),
+    ``terminated`` (N, 1; the task is done), ``truncated`` (N, 1; the time is up) and ``done``
+    (N, 1). ``cost`` is part of the reward spec, like ``reward``. TorchRL's
+    ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])`` therefore sums both over
+    an episode. With a shield there are also ``shield_correction`` (N, 1; how far it has moved the
+    joint targets, rad) and ``shield_braked`` (N, 1; whether it held the arm still).
 
     Attributes:
-        observation_fields: the slices of the observation by the names of its fields.
-        arm_state: what tasks and costs have read, the :class:`~torchrl_safe.envs.ArmState` after
-            the last step or reset.
+        observation_fields: the slice of the observation that each field has, by name.
+        arm_state: the :class:`~torchrl_safe.envs.ArmState` after the last step or reset, which
+            tasks and costs read.
 
     Args:
         arm (ArmModel, optional): the arm. Defaults to ``PANDA``.
@@ -65,7 +65,8 @@ class ArmEnv(EnvBase):
         action (ActionMode, optional): what an action does. Actions beyond its bound (here 1)
             are clipped. Defaults to ``CartesianDelta()``.
         task (Task, optional): goal, reward and success. Defaults to ``Reach()``.
-        obstacles (Obstacles, optional): what stands where. Defaults to ``InFront()``.
+        obstacles (Obstacles, optional): the obstacles and where they are. Defaults to
+            ``InFront()``.
         costs (Mapping[str, Callable], optional): the costs by name, each a callable from
             :class:`~torchrl_safe.envs.ArmState` to an array of shape ``(N,)``. They are read
             over all physics substeps. Defaults to ``{"collision": Collision()}``.
@@ -80,15 +81,15 @@ class ArmEnv(EnvBase):
         shield (Shield, optional): changes actions as little as needed to keep the arm off obstacles
             and table. ``action`` stays what was asked for. Defaults to ``None``.
         seed (int, optional): seed of the goals and obstacles. Every row has a generator of its
-            own; the seeds follow TorchRL's chain: after ``set_seed`` of a ``ParallelEnv`` or a
-            collector, two environments of one world draw what one of two worlds draws. A seed
-            that a factory gives to several workers is the same in each: leave it out there.
+            own, and the seeds follow TorchRL's chain: two environments of one world, seeded by a
+            ``ParallelEnv`` or a collector, draw what one environment of two worlds draws. Do not
+            pass ``seed`` in a factory for several workers: all of them would draw the same.
         device (torch.device, optional): device of the tensors. Defaults to ``None``.
         gui (bool, optional): show the first world in a window. Defaults to ``False``.
 
     Raises:
-        TypeError: if an argument is not of its kind.
-        ValueError: if an argument is not usable, an action, observation, reward or cost is not
+        TypeError: if an argument has the wrong type.
+        ValueError: if an argument cannot be used, an action, observation, reward or cost is not
             finite or has the wrong shape, or the obstacles overlap the arm at home.
         RuntimeError: if the environment is closed or not yet reset, or ``gui`` is wanted and there
             is no screen.
@@ -208,7 +209,7 @@ class ArmEnv(EnvBase):
 
     @property
     def arm_state(self) -> ArmState:
-        """The state after the last step or reset: what tasks and costs have read."""
+        """The state after the last step or reset, which tasks and costs read."""
         return self._state
 
     @property
@@ -220,7 +221,7 @@ class ArmEnv(EnvBase):
         for row in range(self.num_envs):
             self._reset_world(row, np.random.default_rng(0))
         self._state = state = self._read_state()
-        # What the arguments compute is checked here once, so that it fails at the door.
+        # Checks once what the arguments compute, so that errors show when the environment is made.
         joints = state.joint_position.shape[1]
         width = self.action_mode.width(joints)
         check_array(
@@ -381,6 +382,8 @@ class ArmEnv(EnvBase):
 
     def render(self, width: int = 320, height: int = 240, camera: Camera = Camera()) -> Tensor:
         """Draws every world.
+
+        An obstacle that the arm has touched in the last control step is drawn in red.
 
         Args:
             width: width in pixels.

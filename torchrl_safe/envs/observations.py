@@ -12,10 +12,10 @@ from torchrl_safe.envs.state import ArmState, Array
 
 @dataclass(frozen=True)
 class FullObservation:
-    """Where everything is and how it moves, whatever arm, task and obstacles are.
+    """Observes where everything is and how it moves, for any arm, task and obstacles.
 
-    For obstacles at rest that makes the task Markov. What moves on a path keeps its plans to
-    itself: when a patrol turns round, or what a human will reach for next.
+    With obstacles at rest the task is then Markov. The plans of moving obstacles stay hidden: when
+    a patrol turns round, or what a person reaches for next.
 
     The fields, in order; those of free fingers and objects are empty where there are none:
 

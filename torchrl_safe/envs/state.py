@@ -26,10 +26,10 @@ class Trace(dict[str, Array]):
 
 @dataclass(frozen=True)
 class Sensing:
-    """What a cost wants to be measured in every physics substep.
+    """Measurements that a cost needs in every physics substep.
 
     Contacts between arm and obstacles are always measured. Everything else takes time, and is
-    measured only if a cost of the environment asks. The measurements are found by name in
+    measured only if a cost of the environment asks. You find the measurements by name in
     :attr:`ArmState.trace`; N worlds, s substeps, m obstacles, n joints, l links:
 
     Args:

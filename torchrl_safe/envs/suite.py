@@ -120,8 +120,11 @@ _BESIDE_A_PERSON: dict[str, Cost] = {
     "collision": Collision(),
     "separation": SpeedAndSeparation(),
 }
-# Who hardly waits is there before the arm has passed.
-_BUSY_PERSON = Human(pause=(0.05, 0.3))
+# Who hardly waits is there before the arm has passed. At home the arm is left alone: it has to
+# learn how to reach beside the person, not how to get away.
+_BUSY_PERSON = Human(shoulder=(1.2, 0.25, 0.4), rest=(1.0, 0.3, 0.2), pause=(0.05, 0.3))
+# Far enough away that there is room to step back from the hand, and time to push.
+_PERSON_OPPOSITE = Human(shoulder=(1.25, 0.3, 0.4), rest=(1.0, 0.35, 0.2))
 
 
 def _handling(arm: ArmModel, finger_step: float | None = None) -> CartesianDelta:
@@ -154,8 +157,6 @@ SUITE: dict[str, SuiteTask] = {
             _BUSY_PERSON,
             _BESIDE_A_PERSON,
             {"collision": 0.5, "separation": 0.5},
-            # 0.5 m/s along each axis: fast enough to get out of the person's way.
-            CartesianDelta(step=0.025),
         ),
         SuiteTask(
             "iiwa-reach-joints",
@@ -176,16 +177,18 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM6),
             max_episode_steps=200,
+            frames=131_072,
         ),
         SuiteTask(
             "panda-push-human",
             PANDA,
             Push(),
-            Human(),
+            _PERSON_OPPOSITE,
             _BESIDE_A_PERSON,
             {"collision": 0.5, "separation": 2.0},
             _handling(PANDA),
             max_episode_steps=200,
+            frames=131_072,
         ),
         SuiteTask(
             "panda-pick-in-front",
@@ -196,6 +199,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
         SuiteTask(
             "ur10-pick-workspace",
@@ -209,6 +213,7 @@ SUITE: dict[str, SuiteTask] = {
             {"workspace": 0.5, "contact-force": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
         SuiteTask(
             "xarm7-pick-scattered",
@@ -219,6 +224,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
+            frames=131_072,
         ),
     )
 }

@@ -27,7 +27,7 @@ _ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 0.5
 
 @runtime_checkable
 class Task(Protocol):
-    """What :class:`~torchrl_safe.envs.ArmEnv` asks of a task."""
+    """Protocol of a task: objects to move, goals, reward and success."""
 
     @property
     def objects(self) -> tuple[Shape, ...]:

@@ -56,7 +56,7 @@ def last_observation(env: VectorEnv, observation: Any, info: Info, done: NDArray
 
 
 def last_info(info: Info, done: NDArray[np.bool_]) -> dict[str, Any]:
-    """The info of a step, which stands in ``final_info`` where the environment has been reset."""
+    """The info of a step; where the environment has been reset, that of ``final_info``."""
     return _merge(info, entries(info.get("final_info", {})), done)
 
 

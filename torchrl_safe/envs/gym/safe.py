@@ -190,7 +190,7 @@ def _look_up(info: Any, path: tuple[str, ...]) -> Any:
 class SafeGymWrapper(_CostBesideReward):
     """TorchRL's :class:`~torchrl.envs.GymWrapper` for environments that report costs.
 
-    ``cost`` of shape ``(*batch, k)``, float32, stands in the reward spec beside ``reward``. It is
+    ``cost`` of shape ``(*batch, k)``, float32, is part of the reward spec, beside ``reward``. It is
     read from the info of ``step``, or, for the name ``"cost"``, from its third output where there
     are six, as in Safety-Gymnasium. ``reset`` returns none.
 

@@ -29,6 +29,8 @@ _NEAREST, _REACH = 0.12, 0.62
 class Human:
     """A person opposite the arm: capsules for upper arm and forearm with the hand, and a head.
 
+    Pictures show the rest of the body too, which collides with nothing.
+
     The hand waits beside the shoulder, reaches for a point on the way from start to goal, rests
     there for a while, goes back and begins again with another point. It moves along straight
     lines with the minimum-jerk profile of human reaching (Flash & Hogan 1985, J. Neurosci. 5(7));

@@ -98,7 +98,7 @@ class Placement:
 
 @runtime_checkable
 class Obstacles(Protocol):
-    """What :class:`~torchrl_safe.envs.ArmEnv` asks of a layout of obstacles."""
+    """Protocol of a layout of obstacles: their shapes, and where they are in an episode."""
 
     @property
     def shapes(self) -> tuple[Shape, ...]:

@@ -25,7 +25,7 @@ def _unit(direction: tuple[float, float, float] | None, across: Array) -> Array:
 
 @runtime_checkable
 class Motion(Protocol):
-    """What :class:`Moving` asks of a motion."""
+    """Protocol of a motion for :class:`Moving`."""
 
     def sample(self, rng: np.random.Generator, across: Array) -> Callable[[Array], Array]:
         """Draws one obstacle's motion: maps times, s, ``(s,)``, to displacements, m, ``(s, 3)``.

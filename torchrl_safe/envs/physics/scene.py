@@ -20,10 +20,12 @@ class Scene:
         gravity: m/s^2, downwards.
         free_fingers: leave the joints that are not part of the arm movable.
         motor_limits: keep the motors within the efforts and speeds of the URDF.
+        motor_strength: share of the URDF's efforts that the motors have.
 
     Raises:
         TypeError: if a flag is not True or False.
-        ValueError: if ``gravity`` is not finite.
+        ValueError: if ``gravity`` is not finite, ``motor_strength`` is not positive, or it is not 1
+            for motors without limits.
 
     Examples:
         >>> Scene(gravity=1.62).motor_limits
@@ -33,15 +35,21 @@ class Scene:
     gravity: float = 9.81
     free_fingers: bool = False
     motor_limits: bool = True
+    motor_strength: float = 1.0
 
     def __post_init__(self) -> None:
         check_array("gravity", self.gravity, ())
+        check_positive(motor_strength=self.motor_strength)
         check_flag(free_fingers=self.free_fingers, motor_limits=self.motor_limits)
+        if self.motor_strength != 1 and not self.motor_limits:
+            raise ValueError(
+                f"motor_strength must be 1 without motor_limits, got {self.motor_strength}."
+            )
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where :meth:`~torchrl_safe.envs.ArmEnv.render` looks from.
+    """A camera for :meth:`~torchrl_safe.envs.ArmEnv.render`.
 
     Args:
         eye: position of the camera, m.

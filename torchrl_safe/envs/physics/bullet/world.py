@@ -117,6 +117,7 @@ class World:
         )
         self._driven = self._arm.joints + self._arm.fingers
         unlimited = np.full(len(self._driven), np.inf)
+        self._efforts = [scene.motor_strength * effort for effort in self._arm.effort]
         self._fastest = (self._arm.speed if scene.motor_limits else unlimited).tolist()
         self._readings = Readings(
             client, self._arm, furniture, len(shapes), sensing, fresh_links=options.fresh_links
@@ -269,7 +270,7 @@ class World:
         count, gain = len(targets), self._options.motor_gain
         driven, options = self._driven[:count], {"physicsClientId": self._client}
         if self._scene.motor_limits:
-            options["forces"] = self._arm.effort[:count]
+            options["forces"] = self._efforts[:count]
         if gain is not None:
             pybullet.setJointMotorControlArray(
                 self._arm.body,

@@ -78,7 +78,7 @@ def build_world(
     if sensing.clearance:
         fixed = [obstacle(index) for index, shape in enumerate(shapes) if not shape.mass]
         measure_base(spec, parts.moving, fixed, reach=sensing.clearance)
-    add_motors(spec, parts, limited=scene.motor_limits)
+    add_motors(spec, parts, limited=scene.motor_limits, strength=scene.motor_strength)
     sensors = Sensors(spec, parts, shapes, sensing)
     model, data = _at_home(spec, arm, parts)
     exclude_overlaps(spec, links, model, data)

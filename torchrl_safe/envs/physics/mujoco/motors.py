@@ -32,13 +32,14 @@ _FINGER_EFFORT = 20.0
 FINGER_GROUP = 1
 
 
-def add_motors(spec: Any, parts: ArmParts, *, limited: bool) -> None:
+def add_motors(spec: Any, parts: ArmParts, *, limited: bool, strength: float) -> None:
     """Adds a position and a velocity servo to each joint: first all positions, then velocities.
 
     Args:
         spec: the world; changed in place.
         parts: of the arm.
         limited: keep the two of a joint together within its effort.
+        strength: share of the effort that they have.
     """
     names = parts.joints + parts.fingers
     for kind in ("position", "velocity"):
@@ -52,7 +53,7 @@ def add_motors(spec: Any, parts: ArmParts, *, limited: bool) -> None:
                 motor.set_to_position(kp=1.0, kv=0.0)
             else:
                 motor.set_to_velocity(kv=1.0)
-    for name, effort in zip(names, parts.effort.tolist(), strict=True):
+    for name, effort in zip(names, (strength * parts.effort).tolist(), strict=True):
         if limited and np.isfinite(effort):
             joint = spec.joint(name)
             joint.actfrclimited, joint.actfrcrange = True, (-effort, effort)

@@ -1,0 +1,295 @@
+"""Policies in another world than that of their training: ``python -m experiments.transfer``.
+
+Plays in the other engine, past wider obstacles, with weaker and stronger motors, with noise in what
+is observed and with actions that come a control step late. Stopped and started again, it goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterable, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+import tyro
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+
+from experiments import train
+from experiments.grid import run_grid, save_results
+from torchrl_safe.envs import (
+    SUITE,
+    ArmState,
+    Box,
+    FullObservation,
+    Obstacles,
+    Placement,
+    Scene,
+    Shape,
+    SuiteTask,
+)
+from torchrl_safe.evaluation import evaluate, summarize
+from torchrl_safe.policy import load_policy, shipped_policies
+
+Condition = Literal[
+    "as trained",
+    "other engine",
+    "wider obstacles",
+    "weak motors",
+    "strong motors",
+    "heavy object",
+    "light object",
+    "noise",
+    "delay",
+]
+# By how much sizes, motors and masses change.
+_CHANGE = 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Evaluate policies under changed conditions."""
+
+    policies: tuple[str, ...] = ()
+    """Names of policies that come with the package, or files of a suite's policies; by default all
+    that come with it."""
+    conditions: tuple[Condition, ...] = get_args(Condition)
+    """What is changed: by 20 % where it is a size, a strength or a mass; the noise has a standard
+    deviation of 0.01 rad, m and so on, the delay is one control step."""
+    episodes: int = 256
+    """Episodes of each policy under each condition, the same for all."""
+    seed: int = 3_000_000
+    """Seed of the episodes; that of the cards."""
+    jobs: int = os.cpu_count() or 1
+    """Evaluations side by side."""
+    out: Path = Path("runs/transfer")
+    """Folder of results; what is already there is not played again."""
+
+    def __post_init__(self) -> None:
+        if not self.conditions:
+            raise ValueError("conditions must name at least one, got none.")
+        for name, least in (("episodes", 2), ("jobs", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}.")
+        if not self.chosen:
+            raise ValueError("policies must name at least one: none comes with the package.")
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """What to play with: ``policies``, or all that come with the package."""
+        return self.policies or tuple(shipped_policies())
+
+
+@dataclasses.dataclass(frozen=True)
+class Wider:
+    """A layout with wider obstacles in the same places, as high as before.
+
+    Args:
+        layout: the layout.
+        factor: how much wider.
+    """
+
+    layout: Obstacles
+    factor: float
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        return tuple(widen(shape, self.factor) for shape in self.layout.shapes)
+
+    def sample(self, rng: np.random.Generator, start: np.ndarray, goal: np.ndarray) -> Placement:
+        return self.layout.sample(rng, start, goal)
+
+
+def widen(shape: Shape, factor: float) -> Shape:
+    """A shape with its horizontal sizes multiplied; of a ball all are."""
+    if isinstance(shape, Box):
+        x, y, z = shape.half_extents
+        return dataclasses.replace(shape, half_extents=(factor * x, factor * y, z))
+    return dataclasses.replace(shape, radius=factor * shape.radius)
+
+
+class Noisy:
+    """An observation with noise in every number.
+
+    Args:
+        observation: the observation.
+        deviation: standard deviation, in the units of each number.
+        seed: seed of the noise.
+    """
+
+    def __init__(
+        self, observation: Callable[[ArmState], dict[str, Any]], deviation: float, *, seed: int
+    ) -> None:
+        self.observation, self.deviation = observation, deviation
+        self._generator = np.random.default_rng(seed)
+
+    def __call__(self, state: ArmState) -> dict[str, Any]:
+        fields = self.observation(state)
+        return {
+            name: field + self.deviation * self._generator.standard_normal(np.shape(field))
+            for name, field in fields.items()
+        }
+
+
+class Delay(Transform):
+    """Gives the environment the action of the step before; 0 in the first step of an episode."""
+
+    def __init__(self) -> None:
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+        self._before: Tensor | None = None
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"]
+        before = torch.zeros_like(action) if self._before is None else self._before
+        self._before = action.clone()
+        return tensordict.set("action", before)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or self._before is None:
+            self._before = None
+        else:
+            self._before = torch.where(mask, 0.0, self._before)
+        return tensordict_reset
+
+
+def lighter(task: SuiteTask, factor: float) -> SuiteTask:
+    """The same task with the mass of its object multiplied."""
+    shape = task.task.shape  # type: ignore[attr-defined]
+    shape = dataclasses.replace(shape, mass=factor * shape.mass)
+    return dataclasses.replace(task, task=dataclasses.replace(task.task, shape=shape))  # type: ignore[type-var]
+
+
+def applies(task: SuiteTask, condition: Condition) -> bool:
+    """Whether there is something to change."""
+    return bool(task.task.objects) or not condition.endswith("object")
+
+
+def make_env(
+    task: SuiteTask, condition: Condition, *, physics: str, num_envs: int, seed: int
+) -> EnvBase:
+    """Makes the environment of a task under a condition.
+
+    Args:
+        task: the task.
+        condition: what is changed.
+        physics: the engine of the training.
+        num_envs: worlds.
+        seed: seed of the noise.
+    """
+    settings: dict[str, Any] = {"num_envs": num_envs}
+    match condition:
+        case "other engine":
+            physics = "bullet" if physics == "mujoco" else "mujoco"
+        case "wider obstacles":
+            wider = Wider(task.obstacles, 1 + _CHANGE)
+            task = dataclasses.replace(task, obstacles=wider)
+        case "weak motors":
+            settings["scene"] = Scene(motor_strength=1 - _CHANGE)
+        case "strong motors":
+            settings["scene"] = Scene(motor_strength=1 + _CHANGE)
+        case "heavy object":
+            task = lighter(task, 1 + _CHANGE)
+        case "light object":
+            task = lighter(task, 1 - _CHANGE)
+        case "noise":
+            settings["observation"] = Noisy(FullObservation(), 0.01, seed=seed)
+    env = task.make_env(physics=train.PHYSICS[physics], **settings)
+    return TransformedEnv(env, Delay()) if condition == "delay" else env
+
+
+def run(policy: str, condition: Condition, episodes: int, seed: int) -> dict[str, Any]:
+    """Plays with a policy under a condition; returns its task and its figures."""
+    torch.set_num_threads(1)
+    saved = load_policy(policy)
+    name = saved.settings["suite_task"]
+    task = SUITE[name]
+    if not applies(task, condition):
+        return {"task": name, "evaluation": None}
+    physics = saved.settings["physics"]
+    env = make_env(task, condition, physics=physics, num_envs=32, seed=seed)
+    try:
+        played = evaluate(env, saved.actor, episodes, seed=seed)
+    finally:
+        env.close()
+    return {"task": name, "evaluation": summarize(played, tuple(task.cost_limits))}
+
+
+def table(runs: Sequence[dict[str, Any]]) -> str:
+    """Returns a Markdown table: a row for each policy, success and costs under each condition.
+
+    A cost above its limit is bold.
+    """
+    conditions = [*dict.fromkeys(run["condition"] for run in runs)]
+    policies = [*dict.fromkeys((run["policy"], run["task"]) for run in runs)]
+    cells = {(run["policy"], run["condition"]): run["evaluation"] for run in runs}
+    lines = [
+        "| policy | limits | " + " | ".join(conditions) + " |",
+        "|---" * (2 + len(conditions)) + "|",
+    ]
+    for policy, task in policies:
+        limits = SUITE[task].cost_limits
+        shown = ", ".join(f"{name} {limit:g}" for name, limit in limits.items())
+        row = [_cell(cells[policy, condition], limits) for condition in conditions]
+        lines.append(f"| {policy} | {shown} | " + " | ".join(row) + " |")
+    within = [
+        sum(
+            all(figures[f"cost/{cost}"][0] <= limit for cost, limit in limits_of(task))
+            for policy, task in policies
+            if (figures := cells[policy, condition]) is not None
+        )
+        for condition in conditions
+    ]
+    asked = [sum(cells[policy, c] is not None for policy, _ in policies) for c in conditions]
+    counts = [f"{kept}/{of}" for kept, of in zip(within, asked, strict=True)]
+    lines.append("| within every limit | | " + " | ".join(counts) + " |")
+    lines.append("\nSuccess; the mean of each cost, bold where it is above its limit.")
+    return "\n".join(lines)
+
+
+def limits_of(task: str) -> Iterable[tuple[str, float]]:
+    """Costs and their limits."""
+    return SUITE[task].cost_limits.items()
+
+
+def _cell(figures: dict[str, list[float]] | None, limits: Any) -> str:
+    if figures is None:
+        return ""
+    costs = []
+    for name, limit in limits.items():
+        cost = figures[f"cost/{name}"][0]
+        costs.append(f"**{cost:.2f}**" if cost > limit else f"{cost:.2f}")
+    return f"{figures['success'][0]:.0%}; {', '.join(costs)}"
+
+
+def main(config: Config) -> None:
+    """Plays what is missing, then writes the table and results.json."""
+    cases = list(product(config.chosen, config.conditions))
+    jobs = {
+        config.out / f"{Path(policy).stem}-{condition.replace(' ', '-')}.json": (
+            policy,
+            condition,
+            config.episodes,
+            config.seed,
+        )
+        for policy, condition in cases
+    }
+    if len(jobs) < len(cases):
+        raise ValueError(f"policies must have different names, got {config.chosen}.")
+    results = run_grid(run, jobs, workers=config.jobs, name="transfer")
+    runs = [
+        {"policy": Path(policy).stem, "condition": condition, **result}
+        for (policy, condition), result in zip(cases, results, strict=True)
+    ]
+    save_results(config.out, config, runs, table(runs))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,185 @@
+"""Changed worlds are changed in what they say, and in nothing else."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import check_env_specs
+from torchrl.modules import MLP
+
+from experiments import transfer
+from experiments.config import suite_config
+from torchrl_safe.envs import (
+    SUITE,
+    ArmEnv,
+    Box,
+    Bullet,
+    Capsule,
+    Cylinder,
+    FullObservation,
+    Human,
+    MuJoCo,
+    NoObstacles,
+    Scene,
+    Sphere,
+)
+from torchrl_safe.policy import save_policy
+
+NAME = "panda-reach-human"
+LIMIT = SUITE[NAME].cost_limits["separation"]
+FAST = MuJoCo(threads=1)
+
+
+def step(env, action):
+    action = torch.tensor(action).expand(env.action_spec.shape)
+    return env.step(TensorDict({"action": action.clone()}, batch_size=env.batch_size))["next"]
+
+
+@pytest.mark.usefixtures("engine")
+def test_weak_motors_are_slower_and_never_stronger_than_their_share(make_env):
+    """From rest at full action: what a motor of a hundredth does is far less."""
+    moved = {}
+    for strength in (0.01, 0.8, 1.0):
+        scene = Scene(motor_strength=strength)
+        env = make_env(ArmEnv, obstacles=NoObstacles(), scene=scene, seed=0)
+        start = env.reset()["observation"].clone()
+        after = step(env, [[1.0, 0.0, 0.0]])["observation"]
+        moved[strength] = (after - start)[0, env.observation_fields["ee_position"]].norm().item()
+    assert moved[0.01] < 0.5 * moved[1.0]
+    assert moved[0.01] < moved[0.8] <= moved[1.0] + 1e-4
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"motor_strength": 0.0}, "motor_strength must be positive and finite, got 0.0"),
+        ({"motor_strength": 0.5, "motor_limits": False}, "must be 1 without motor_limits, got 0.5"),
+    ],
+)
+def test_bad_strengths(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Scene(**settings)
+
+
+def test_shapes_are_wider_and_as_high():
+    for shape, expected in (
+        (Box((0.1, 0.2, 0.3)), (0.12, 0.24, 0.3)),
+        (Cylinder(0.1, 0.4), (0.12, 0.12, 0.2)),
+        (Capsule(0.1, 0.4), (0.12, 0.12, 0.32)),
+        (Sphere(0.1), (0.12, 0.12, 0.12)),
+    ):
+        assert transfer.widen(shape, 1.2).half_extents == pytest.approx(expected)
+    wide, human = transfer.Wider(Human(), 1.2), Human()
+    assert [s.radius for s in wide.shapes] == pytest.approx([1.2 * s.radius for s in human.shapes])
+    places = [
+        layout.sample(np.random.default_rng(0), np.zeros(3), np.ones(3)).at(np.array([0.7]))[0]
+        for layout in (wide, human)
+    ]
+    np.testing.assert_array_equal(*places)
+
+
+def test_actions_come_a_step_late(make_env):
+    env = make_env(TransformedEnv, ArmEnv(num_envs=2, physics=FAST, seed=0), transfer.Delay())
+    plain = make_env(ArmEnv, num_envs=2, physics=FAST, seed=0)
+    check_env_specs(env, seed=1)
+    env.set_seed(0)
+    plain.set_seed(0)
+    env.reset()
+    plain.reset()
+    moves = [[0.5, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.3]]
+    late = [step(env, move) for move in moves]
+    expected = [step(plain, move) for move in ([0.0, 0.0, 0.0], *moves[:2])]
+    for one, other in zip(late, expected, strict=True):
+        assert torch.equal(one["observation"], other["observation"])
+    # The world that begins anew begins at rest; the other goes on.
+    mask = torch.tensor([[True], [False]])
+    for each in (env, plain):
+        each.reset(TensorDict({"_reset": mask}, batch_size=[2]))
+    one = step(env, [0.0, 0.0, 0.0])["observation"]
+    other = step(plain, [[0.0, 0.0, 0.0], moves[2]])["observation"]
+    assert torch.equal(one, other)
+
+
+def test_noise_is_what_it_says_and_repeats(make_env):
+    env = make_env(ArmEnv, num_envs=8, physics=FAST, seed=0)
+    state = env.arm_state
+    clean, noisy = FullObservation(), transfer.Noisy(FullObservation(), 0.01, seed=3)
+    again = transfer.Noisy(FullObservation(), 0.01, seed=3)
+    first, second, third = noisy(state), again(state), noisy(state)
+    errors = np.concatenate([first[name] - clean(state)[name] for name in first], axis=1)
+    assert errors.std() == pytest.approx(0.01, rel=0.15)
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+    assert not np.array_equal(first["to_goal"], third["to_goal"])
+
+
+@pytest.mark.parametrize("condition", transfer.Config.__dataclass_fields__["conditions"].default)
+def test_each_condition_makes_an_environment(make_env, condition):
+    task = SUITE["panda-pick-in-front"]
+    assert transfer.applies(task, condition)
+    env = make_env(transfer.make_env, task, condition, physics="mujoco", num_envs=1, seed=0)
+    arm = env.base_env if isinstance(env, TransformedEnv) else env
+    rows = {
+        "other engine": arm.physics == Bullet(),
+        "wider obstacles": arm.obstacles.shapes[0].radius == pytest.approx(0.06),
+        "weak motors": arm.scene.motor_strength == 0.8,
+        "strong motors": arm.scene.motor_strength == 1.2,
+        "heavy object": arm.task.shape.mass == pytest.approx(0.12),
+        "light object": arm.task.shape.mass == pytest.approx(0.08),
+        "noise": isinstance(arm.observation, transfer.Noisy),
+        "delay": arm is not env,
+    }
+    assert {name for name, changed in rows.items() if changed} == {condition} - {"as trained"}
+    assert not transfer.applies(SUITE[NAME], "heavy object")
+
+
+def test_table_and_folder(tmp_path, capsys):
+    env = SUITE[NAME].make_env(num_envs=1, physics=FAST)
+    width = env.observation_spec["observation"].shape[-1]
+    env.close()
+    actor = TensorDictModule(MLP(width, 3, num_cells=[4]), ["observation"], ["action"])
+    settings = dataclasses.asdict(suite_config(NAME, physics="mujoco"))
+    settings = json.loads(json.dumps({**settings, "name": "ppo"}, default=str))
+    spec = Composite(observation=Unbounded(width))
+    save_policy(tmp_path / "mine.pt", actor, spec, settings=settings)
+    config = transfer.Config(
+        policies=(str(tmp_path / "mine.pt"),),
+        conditions=("as trained", "heavy object"),
+        episodes=32,
+        jobs=1,
+        out=tmp_path / "out",
+    )
+    transfer.main(config)
+    lines = capsys.readouterr().out.splitlines()
+    row = next(line for line in lines if line.startswith("| mine |"))
+    assert row.startswith(f"| mine | collision 0.5, separation {LIMIT:g} | ")
+    assert row.endswith("|  |")
+    (last,) = (line for line in lines if line.startswith("| within every limit"))
+    assert last.endswith("| 0/0 |")
+
+
+def test_costs_above_their_limits_are_bold():
+    figures = {"success": [0.5], "cost/collision": [0.5], "cost/separation": [LIMIT + 0.01]}
+    run = {"policy": "p", "task": NAME, "condition": "delay", "evaluation": figures}
+    row, counts = transfer.table([run]).splitlines()[2:4]
+    shown = f"**{LIMIT + 0.01:.2f}**"
+    assert row == f"| p | collision 0.5, separation {LIMIT:g} | 50%; 0.50, {shown} |"
+    assert counts == "| within every limit | | 0/1 |"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"conditions": ()}, "conditions must name at least one, got none"),
+        ({"episodes": 1}, "episodes must be at least 2, got 1"),
+        ({"jobs": 0}, "jobs must be at least 1, got 0"),
+    ],
+)
+def test_bad_settings(settings, message):
+    with pytest.raises(ValueError, match=message):
+        transfer.Config(**{"policies": ("p",), **settings})
