@@ -108,7 +108,10 @@ def save_film(
             stage.set_seed(seed)
             stages.append((name, stage, policy, pace))
         for _ in range(episodes):
-            clips = {name: film(*stage, camera, size) for name, *stage in stages}
+            clips = {
+                name: film(stage, policy, pace, camera, size)
+                for name, stage, policy, pace in stages
+            }
             for index in range(max(map(len, clips.values()))):
                 panels = [
                     _panel(name, clip[: index + 1], limits or {}, width, camera, len(clip))
@@ -268,7 +271,9 @@ def _panel(
     lines = len(now.cost) + 1
     full = (width * scale, (_HEAD + height + _FOOT * lines // 2) * scale)
     panel = Image.new("RGB", full, "white")
-    picture = Image.fromarray(now.picture).resize((width * scale, height * scale), Image.BICUBIC)
+    picture = Image.fromarray(now.picture).resize(
+        (width * scale, height * scale), Image.Resampling.BICUBIC
+    )
     panel.paste(picture, (0, _HEAD * scale))
     draw = ImageDraw.Draw(panel)
     _draw_trail(draw, clip, colour(name), camera, (width * scale, height * scale), _HEAD * scale)
@@ -366,7 +371,7 @@ def _in_rows(panels: Sequence[Image.Image]) -> Image.Image:
         row, column = divmod(index, columns)
         sheet.paste(panel, (gap + column * (width + gap), gap + row * (height + gap)))
     ImageDraw.Draw(sheet).rectangle((0, 0, full[0] - 1, full[1] - 1), outline=LIGHT, width=_SCALE)
-    return sheet.resize((full[0] // _SCALE, full[1] // _SCALE), Image.BOX)
+    return sheet.resize((full[0] // _SCALE, full[1] // _SCALE), Image.Resampling.BOX)
 
 
 def project(

@@ -29,7 +29,7 @@ from experiments.algorithms import ALGORITHMS, Training
 from experiments.config import AlgorithmName, Config, command_line
 from experiments.demonstrations import start_from_demonstrations
 from experiments.files import is_new, write_whole
-from experiments.film import save_film
+from experiments.film import Policy, save_film
 from experiments.grid import side_by_side
 from experiments.log import Log, figures, progress_text, score, summed_costs, versions
 from experiments.report import plot_curves, save_picture, table
@@ -356,7 +356,7 @@ def result_of(config: Config, algorithm: AlgorithmName, line: int = 0) -> dict[s
 
 def film(config: Config, path: Path, *, seed: int, **options: Any) -> None:
     """Films the policies of a run side by side; ``options`` are those of :func:`save_film`."""
-    actors = {
+    actors: dict[str, tuple[EnvBase, Policy]] = {
         name: (
             make_env(config, num_envs=1, algorithm=name),
             load_policy(config.out / name / "policy.pt").actor,

@@ -52,7 +52,14 @@ class _Pairs(NamedTuple):
 
     def of(self, rows: NDArray[np.int_]) -> _Pairs:
         """Those of some worlds."""
-        return _Pairs(*(part[rows] for part in self[:-1]), self.other)
+        return _Pairs(
+            self.room[rows],
+            self.spare[rows],
+            self.closing[rows],
+            self.joints[rows],
+            self.fingers[rows],
+            self.other,
+        )
 
 
 class _Step(NamedTuple):
