@@ -124,7 +124,7 @@ guess = ArmModel(
 try:
     find_home(guess, position=(1.5, 0.0, 0.2))
 except ValueError as error:
-    print(fill(str(error), 96))
+    print(fill(str(error), 84))
 
 # %%
 # The second is a tool that points down in the wrong way. ``(1, 0, 0, 0)``, the default, and ``(0,
@@ -136,7 +136,7 @@ for orientation in ((1, 0, 0, 0), (0, 1, 0, 0)):
         home = find_home(guess, position=(0.35, 0.0, 0.2), orientation=orientation)
         print(orientation, "gives", [round(angle, 2) for angle in home])
     except ValueError as error:
-        print(fill(f"{orientation} fails: {error}", 96), "\n")
+        print(fill(f"{orientation} fails: {error}", 84), "\n")
 
 # %%
 # Goals
@@ -151,7 +151,7 @@ arm = replace(guess, home=home, goals=Region(low=(0.55, -0.2, 0.05), high=(0.62,
 try:
     ArmEnv(replace(arm, goals=Region(low=(0.55, -0.2, 0.05), high=(1.0, 0.2, 0.15))))
 except ValueError as error:
-    print(fill(str(error), 96))
+    print(fill(str(error), 84))
 
 # %%
 # Look at it

@@ -59,7 +59,7 @@ def outcome(check, *arguments, **options):
     try:
         check(*arguments, **options)
     except AssertionError as error:
-        return fill(f"{check.__name__} failed: {error}", 96)
+        return fill(f"{check.__name__} failed: {error}", 84)
     return f"{check.__name__} passed"
 
 
