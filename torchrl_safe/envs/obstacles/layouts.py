@@ -187,8 +187,11 @@ class InFront:
         return (self.shape,)
 
     def sample(self, rng: np.random.Generator, start: Array, goal: Array) -> Placement:
-        way = np.array(goal - start if self.direction is None else self.direction, dtype=float)
-        way[2] = 0
+        if self.direction is None:
+            way = (goal - start) * (1, 1, 0)
+        else:
+            # Its length could be too small or too large for a number, once squared.
+            way = np.array(self.direction) / np.abs(self.direction).max()
         length = np.linalg.norm(way)
         if self.direction is None and length <= self.gap:
             raise NoRoomError(
