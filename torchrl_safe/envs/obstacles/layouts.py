@@ -190,7 +190,7 @@ class InFront:
         if self.direction is None:
             way = (goal - start) * (1, 1, 0)
         else:
-            # Its length could be too small or too large for a number, once squared.
+            # The square of a short one could be 0.
             way = np.array(self.direction) / np.abs(self.direction).max()
         length = np.linalg.norm(way)
         if self.direction is None and length <= self.gap:
