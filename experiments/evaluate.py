@@ -209,9 +209,9 @@ def main(config: Config) -> None:
         figures, names = play(env, saved, config, limits), cost_names(env)
     finally:
         env.close()
-    text = figures_table(
-        {config.policy.parent.name: figures}, dict(zip(names, limits, strict=True))
-    )
+    # A policy of the package is in no folder.
+    name = config.policy.parent.name or config.policy.name
+    text = figures_table({name: figures}, dict(zip(names, limits, strict=True)))
     print(text)
     if config.out is not None:
         config.out.mkdir(parents=True, exist_ok=True)

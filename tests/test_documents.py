@@ -208,6 +208,12 @@ def test_an_observation_of_ones_own(tmp_path):
     assert run(script).endswith("14 slice(13, 14, None)\n")
 
 
+def test_suite(tmp_path):
+    script = tmp_path / "suite.py"
+    script.write_text("\n".join(code_of("docs/suite.md")), encoding="utf-8")
+    run(script)
+
+
 def test_shield(tmp_path):
     (script := tmp_path / "shield.py").write_text(*code_of("docs/shield.md"), encoding="utf-8")
     assert run(script).startswith("torch.Size([2, 5, 1])")

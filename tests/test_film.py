@@ -152,7 +152,7 @@ def test_what_cannot_be_divided_is_filmed_as_it_is(make_env, tmp_path):
                 Compose(RewardSum(["cost"], ["episode_cost"]), EarlyTermination(budget=1.0)),
             )
         ),
-        make_env(ArmEnv, task=Push(), max_episode_steps=90),
+        make_env(ArmEnv, task=Push(), max_episode_steps=41),
     ):
         policy = RandomPolicy(env.action_spec)
         save_film({"ppo": (env, policy)}, tmp_path / "film.webp", seed=0, episodes=1, width=32)

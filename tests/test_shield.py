@@ -436,15 +436,20 @@ def test_what_the_next_step_needs_is_looked_at(make_env):
     assert tally.touches == tally.table == 0, str(tally)
 
 
-@pytest.mark.parametrize("task", [Push(), PickAndPlace(on_table=1.0)], ids=lambda t: str(t)[:4])
-def test_it_lets_an_arm_push_and_pick_up(make_env, task):
-    """Down to the table and beside the obstacle, to which the shield has no objection."""
+@pytest.mark.parametrize(
+    ("task", "obstacles"),
+    [(Push(), NoObstacles()), (PickAndPlace(on_table=1.0), InFront())],
+    ids=["push", "pick"],
+)
+def test_it_lets_an_arm_push_and_pick_up(make_env, task, obstacles):
+    """Down to the table, and beside the obstacle."""
     action = CartesianDelta(
         step=0.03,
         orientation=PANDA.handling_orientation,
         finger_step=0.04 if isinstance(task, PickAndPlace) else None,
     )
-    settings = {"task": task, "action": action, "max_episode_steps": 200, "seed": 3}
+    settings = {"task": task, "obstacles": obstacles, "action": action, "seed": 3}
+    settings["max_episode_steps"] = 200
     physics = ENGINES["mujoco"]
     env = make_env(ArmEnv, num_envs=4, physics=physics, shield=Shield(), **settings)
     env.reset()

@@ -25,6 +25,11 @@ NAME = "panda-reach-human"
 each_policy = pytest.mark.parametrize("name", CARDS)
 
 
+def test_there_are_some():
+    assert "panda-reach-in-front" in CARDS
+    assert {path.stem for path in FOLDER.glob("*.pt")} == set(CARDS) <= set(SUITE)
+
+
 @each_policy
 def test_each_plays_as_its_card_says(name):
     """64 other episodes are within four standard errors of the 256 of the card."""
@@ -55,6 +60,11 @@ def test_each_is_of_its_task_and_small(name):
     assert "out" not in saved.settings
     assert not re.search(rb"/(work|home|root|tmp|usr)/", file.read_bytes())
     assert name in card["trained"]
+
+
+def test_it_is_evaluated_by_its_name(capsys):
+    evaluate.main(evaluate.Config(Path("panda-reach-in-front"), episodes=2, envs=2))
+    assert "| panda-reach-in-front | " in capsys.readouterr().out
 
 
 @pytest.fixture

@@ -50,7 +50,7 @@ class ArmEnv(EnvBase):
     (N, 1). ``cost`` is part of the reward spec, like ``reward``. TorchRL's
     ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])`` therefore sums both over
     an episode. With a shield there are also ``shield_correction`` (N, 1; how far it has moved the
-    joint targets, rad) and ``shield_braked`` (N, 1; whether it held the arm still).
+    joint targets, rad) and ``shield_braked`` (N, 1; whether it braked).
 
     Attributes:
         observation_fields: the slice of the observation that each field has, by name.

@@ -31,6 +31,8 @@ def distance_jacobian(
         array([[[2.]]])
     """
     lines = np.concatenate([cross(point, normal), normal], axis=2)
-    slides = slides[:, None]
-    turning, moving = np.where(slides, 0.0, axis), np.where(slides, axis, cross(anchor, axis))
+    turning, moving = axis, cross(anchor, axis)
+    if slides.any():
+        slides = slides[:, None]
+        turning, moving = np.where(slides, 0.0, axis), np.where(slides, axis, moving)
     return lines @ np.concatenate([turning, moving], axis=2).transpose(0, 2, 1)

@@ -20,6 +20,8 @@ from torchrl_safe.envs.vectors import cross
 _ERROR = 0.1
 # Of what the joints hardly move, m/rad, and of joints without limits, rad.
 _SHORTEST, _FAR = 1e-3, 1e3
+# What is no distance, m.
+_TOLERANCE = 1e-9
 # Of what the joints can do to stop, the part that is counted on: others may have to turn on.
 _SURE = 1 / 3
 
@@ -31,7 +33,7 @@ class Shielded(NamedTuple):
     joints: Array
     #: Finger targets, m, as they came, or where the fingers are.
     fingers: Array
-    #: Which worlds hold still because nothing else is safe, ``(N,)``.
+    #: Which worlds brake because nothing that was asked for is safe, ``(N,)``.
     braked: NDArray[np.bool_]
 
 
@@ -52,14 +54,8 @@ class _Pairs(NamedTuple):
 
     def of(self, rows: NDArray[np.int_]) -> _Pairs:
         """Those of some worlds."""
-        return _Pairs(
-            self.room[rows],
-            self.spare[rows],
-            self.closing[rows],
-            self.joints[rows],
-            self.fingers[rows],
-            self.other,
-        )
+        room, spare, closing, joints, fingers, other = self
+        return _Pairs(room[rows], spare[rows], closing[rows], joints[rows], fingers[rows], other)
 
 
 class _Step(NamedTuple):
@@ -104,8 +100,11 @@ class Shield:
     takes up the room that is left, whichever is more. So far from everything the shield changes
     nothing. The solver is exact; what is linear in it is checked: where the end of the step could
     be too near, the distances there are measured too, and become inequalities of a second problem,
-    in which one more step like this one, slower by b, has to be safe there as well. If there is no
-    solution, the arm holds still, which the key ``shield_braked`` says.
+    in which one more step like this one, slower by b, has to be safe there as well.
+
+    If there is no solution, the arm brakes, which the key ``shield_braked`` says: it takes the
+    motion nearest to a stand that does not use up more than all the room, or if there is none, it
+    holds still.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -116,7 +115,7 @@ class Shield:
     - and within a control step the arm does not turn so far that a shape comes near in its middle
       and leaves again: the distances at both ends are checked, those between follow from them to
       within the same margin,
-    - and there is a solution. An arm that has to hold still at full speed needs some way to do so.
+    - and there is a solution. An arm that has to brake from full speed needs some way to do so.
 
     With obstacles that move, their velocity counts: the arm gives way as far as its joints allow.
     As their future is unknown, the guarantee is another: the arm is not the one that moves into
@@ -209,7 +208,11 @@ class Shield:
             least = least - (now.fingers @ opening[:, :, None])[:, :, 0]
         least = _attainable(now.joints, least, lower, upper)
         rows, least = self._with_walls(step, now.joints, least)
-        change, solved = project(asked, rows, least, lower, upper)
+        # What stops above the margin, if nothing leaves room to stop in.
+        last = least.copy()
+        pairs = now.room.shape[1]
+        last[:, :pairs] = np.minimum(last[:, :pairs], now.closing - now.room)
+        change, solved, braked = _solve(asked, rows, least, last, lower, upper)
         # Where the end of the step could be too near, that is measured as well.
         left = now.room - now.closing + (now.joints @ change[:, :, None])[:, :, 0]
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
@@ -221,17 +224,23 @@ class Shield:
             # And one more step like this one, as much slower as it can be, is to be safe there.
             needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.joints))
             needed = _attainable(then.joints, needed, lower[again], upper[again])
-            change[again], solved[again] = project(
+            most = np.minimum(needed, then.closing - then.room + turned)
+            # What satisfies these too is the solution of both.
+            short = np.flatnonzero((turned < needed - _TOLERANCE).any(axis=1))
+            again = again[short]
+        if len(again):
+            change[again], solved[again], braked[again] = _solve(
                 asked[again],
-                np.concatenate([rows[again], then.joints], axis=1),
-                np.concatenate([least[again], needed], axis=1),
+                np.concatenate([rows[again], then.joints[short]], axis=1),
+                np.concatenate([least[again], needed[short]], axis=1),
+                np.concatenate([last[again], most[short]], axis=1),
                 lower[again],
                 upper[again],
             )
         still = ~solved[:, None]
         if fingers.shape[1]:
-            fingers = np.where(still, held, fingers)
-        return Shielded(np.where(still, angles, angles + change), fingers, ~solved)
+            fingers = np.where(braked[:, None], held, fingers)
+        return Shielded(np.where(still, angles, angles + change), fingers, braked)
 
     def _measure(
         self, step: _Step, rows: NDArray[np.int_], angles: Array, fingers: Array
@@ -333,3 +342,21 @@ def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
     best = np.where(rows > 0, rows * upper[:, None], rows * lower[:, None]).sum(axis=2)
     middle = (rows @ (0.5 * (lower + upper))[:, :, None])[:, :, 0]
     return np.minimum(least, np.maximum((best + np.maximum(middle, 0)) / 2, 0))
+
+
+def _solve(
+    asked: Array, rows: Array, least: Array, last: Array, lower: Array, upper: Array
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Projects; where there is no solution, to a stand, with ``last`` in place of ``least``.
+
+    Returns:
+        The solutions, where there is one, and which are not of what was asked for.
+    """
+    change, solved = project(asked, rows, least, lower, upper)
+    braked = ~solved
+    some = np.flatnonzero(braked)
+    if len(some):
+        change[some], solved[some] = project(
+            np.zeros_like(asked[some]), rows[some], last[some], lower[some], upper[some]
+        )
+    return change, solved, braked

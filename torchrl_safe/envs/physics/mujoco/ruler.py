@@ -137,16 +137,17 @@ class Ruler:
             # Naming all of them takes longer.
             named = None if len(rows) == len(self._qpos) else rows.tolist()
             self._batch.forward(named, stage=mujoco.mjtStage.mjSTAGE_POS)
+        worlds = rows[:, None]
         ends = self._points[rows].reshape(len(rows), len(self._thing), 2, 3)
         point, way = ends[:, :, 0], ends[:, :, 0] - ends[:, :, 1]
-        distance = np.sqrt((way * way).sum(axis=2))
+        distance = np.sqrt(np.einsum("kri,kri->kr", way, way))
         found = distance > 0
-        normal = way / np.where(found, distance, 1.0)[..., None]
         # Where they overlap, the two points have changed sides.
-        inside = ((self._centres[rows][:, self._geom] - point) * normal).sum(axis=2) < 0
-        sign = np.where(inside, -1.0, 1.0)
-        normal, distance = normal * sign[..., None], distance * sign
-        anchor, axis = self._anchors[rows][:, self._joints], self._axes[rows][:, self._joints]
+        outward = self._centres[worlds, self._geom] - point
+        sign = np.where(np.einsum("kri,kri->kr", outward, way) < 0, -1.0, 1.0)
+        normal = way * (sign / np.where(found, distance, 1.0))[..., None]
+        distance *= sign
+        anchor, axis = self._anchors[worlds, self._joints], self._axes[worlds, self._joints]
         jacobian = distance_jacobian(point, normal, anchor, axis, self._slides) * self._moves
         return Nearest(np.where(found, distance, np.inf), normal, point, jacobian, self._thing)
 
