@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from torchrl_safe.envs import (
+    IIWA,
     PANDA,
     ArmEnv,
     ArmState,
@@ -162,11 +163,12 @@ def make_pilot(env: ArmEnv) -> Pilot:
     """
     if not isinstance(env.action_mode, CartesianDelta):
         raise ValueError(f"demonstrations need Cartesian actions, got {env.action_mode}.")
-    # A Panda's own hand is wider than the gripper of the others, whose elbows fold less.
-    room = (0.27, 0.15) if env.arm == PANDA else (0.22, 0.15)
+    # A Panda's own hand is wider than the gripper of the others, whose elbows fold less, and an
+    # iiwa's least.
+    along = {PANDA: 0.27, IIWA: 0.18}.get(env.arm, 0.22)
     pilots: dict[type, Pilot] = {
         Reach: ReachPilot(),
-        Push: PushPilot(room),
+        Push: PushPilot((along, 0.15)),
         PickAndPlace: PickAndPlacePilot(),
     }
     if type(env.task) not in pilots:
