@@ -35,6 +35,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
 from experiments.compiling import compiled
 from experiments.files import is_new, write_whole
+from experiments.learners import summed
 from experiments.log import Log, figures, versions
 from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.envs.gym import SafeGymEnv
@@ -312,15 +313,6 @@ def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | Violat
     if wanted is move_multiplier:
         return PIDControl(loss, cost_limit=limits)
     return ViolationUpdater(loss, cost_limit=limits)
-
-
-def summed(loss: Callable[..., TensorDictBase]) -> Callable[[TensorDictBase], Tensor]:
-    """A loss as the one number that is minimized."""
-
-    def total(minibatch: TensorDictBase) -> Tensor:
-        return sum(value for key, value in loss(minibatch).items() if key.startswith("loss_"))
-
-    return total
 
 
 class Learner:

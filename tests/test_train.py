@@ -311,7 +311,7 @@ def test_each_epoch_sees_each_step_once():
     def objective(minibatch):
         assert "next" not in minibatch
         seen.append(minibatch["action"][:, 0].tolist())
-        return TensorDict(loss_objective=next(training.actor.parameters()).sum())
+        return next(training.actor.parameters()).sum()
 
     training.learner.phases = [(None, objective)]
     config = Config(envs=5, frames_per_batch=10, workers=1)
