@@ -18,6 +18,17 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_safe.objectives import TrustRegionStep
 
+# What a loss does not read once there are advantages; left out, minibatches are cut faster.
+NOT_LEARNT_FROM = (
+    "next",
+    "done",
+    "terminated",
+    "truncated",
+    "success",
+    "episode_reward",
+    "episode_cost",
+    ("collector", "traj_ids"),
+)
 # What is minimized: a number for a minibatch.
 Objective = Callable[[TensorDictBase], Tensor]
 
@@ -118,8 +129,7 @@ class OnPolicyLearner:
         data = self.loss.estimate_advantages(batch).reshape(-1)
         if self.actor_step is not None:
             self.actor_step.step(data)
-        # All that the losses read of the next steps is in the advantages.
-        data = data.exclude("next")
+        data = data.exclude(*NOT_LEARNT_FROM)
         for prepare, objective in self.phases:
             if prepare is not None:
                 prepare()
