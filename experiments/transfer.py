@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -160,7 +160,7 @@ class Delay(Transform):
         return tensordict_reset
 
 
-def lighter(task: SuiteTask, factor: float) -> SuiteTask:
+def scale_object_mass(task: SuiteTask, factor: float) -> SuiteTask:
     """The same task with the mass of its object multiplied."""
     shape = task.task.shape  # type: ignore[attr-defined]
     shape = dataclasses.replace(shape, mass=factor * shape.mass)
@@ -196,9 +196,9 @@ def make_env(
         case "strong motors":
             settings["scene"] = Scene(motor_strength=1 + _CHANGE)
         case "heavy object":
-            task = lighter(task, 1 + _CHANGE)
+            task = scale_object_mass(task, 1 + _CHANGE)
         case "light object":
-            task = lighter(task, 1 - _CHANGE)
+            task = scale_object_mass(task, 1 - _CHANGE)
         case "noise":
             settings["observation"] = Noisy(FullObservation(), 0.01, seed=seed)
     env = task.make_env(physics=train.PHYSICS[physics], **settings)
@@ -241,7 +241,10 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
         lines.append(f"| {policy} | {shown} | " + " | ".join(row) + " |")
     within = [
         sum(
-            all(figures[f"cost/{cost}"][0] <= limit for cost, limit in limits_of(task))
+            all(
+                figures[f"cost/{cost}"][0] <= limit
+                for cost, limit in SUITE[task].cost_limits.items()
+            )
             for policy, task in policies
             if (figures := cells[policy, condition]) is not None
         )
@@ -252,11 +255,6 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
     lines.append("| within every limit | | " + " | ".join(counts) + " |")
     lines.append("\nSuccess; the mean of each cost, bold where it is above its limit.")
     return "\n".join(lines)
-
-
-def limits_of(task: str) -> Iterable[tuple[str, float]]:
-    """Costs and their limits."""
-    return SUITE[task].cost_limits.items()
 
 
 def _cell(figures: dict[str, list[float]] | None, limits: Any) -> str:
