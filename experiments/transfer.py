@@ -1,7 +1,8 @@
 """Policies in another world than that of their training: ``python -m experiments.transfer``.
 
-Plays in the other engine, past wider obstacles, with weaker and stronger motors, with noise in what
-is observed and with actions that come a control step late. Stopped and started again, it goes on.
+Plays in the other engine, past wider obstacles, with weaker and stronger motors, other masses and
+friction, noisy observations, and actions that come a control step late. Stopped and started again,
+it goes on.
 """
 
 from __future__ import annotations
@@ -42,12 +43,16 @@ Condition = Literal[
     "wider obstacles",
     "weak motors",
     "strong motors",
+    "heavy links",
+    "light links",
     "heavy object",
     "light object",
+    "rough",
+    "smooth",
     "noise",
     "delay",
 ]
-# By how much sizes, motors and masses change.
+# By how much sizes, motors, masses and friction change.
 _CHANGE = 0.2
 
 
@@ -59,7 +64,7 @@ class Config:
     """Names of policies that come with the package, or files of a suite's policies; by default all
     that come with it."""
     conditions: tuple[Condition, ...] = get_args(Condition)
-    """What is changed: by 20 % where it is a size, a strength or a mass; the noise has a standard
+    """What is changed: a size, a strength, a mass or friction by 20 %; the noise has a standard
     deviation of 0.01 rad, m and so on, the delay is one control step."""
     episodes: int = 256
     """Episodes of each policy under each condition, the same for all."""
@@ -168,8 +173,9 @@ def scale_object_mass(task: SuiteTask, factor: float) -> SuiteTask:
 
 
 def applies(task: SuiteTask, condition: Condition) -> bool:
-    """Whether there is something to change."""
-    return bool(task.task.objects) or not condition.endswith("object")
+    """Whether there is something to change; friction is that between gripper, object and table."""
+    with_object = condition.endswith("object") or condition in ("rough", "smooth")
+    return bool(task.task.objects) or not with_object
 
 
 def make_env(
@@ -195,6 +201,14 @@ def make_env(
             settings["scene"] = Scene(motor_strength=1 - _CHANGE)
         case "strong motors":
             settings["scene"] = Scene(motor_strength=1 + _CHANGE)
+        case "heavy links":
+            settings["scene"] = Scene(link_mass=1 + _CHANGE)
+        case "light links":
+            settings["scene"] = Scene(link_mass=1 - _CHANGE)
+        case "rough":
+            settings["scene"] = Scene(friction=1 + _CHANGE)
+        case "smooth":
+            settings["scene"] = Scene(friction=1 - _CHANGE)
         case "heavy object":
             task = scale_object_mass(task, 1 + _CHANGE)
         case "light object":

@@ -21,11 +21,14 @@ class Scene:
         free_fingers: leave the joints that are not part of the arm movable.
         motor_limits: keep the motors within the efforts and speeds of the URDF.
         motor_strength: share of the URDF's efforts that the motors have.
+        link_mass: factor of the masses and inertias of the arm's links. The motors are tuned to the
+            masses of the URDF.
+        friction: factor of the friction between any two surfaces.
 
     Raises:
         TypeError: if a flag is not True or False.
-        ValueError: if ``gravity`` is not finite, ``motor_strength`` is not positive, or it is not 1
-            for motors without limits.
+        ValueError: if ``gravity`` is not finite, a factor is not positive, or ``motor_strength`` is
+            not 1 for motors without limits.
 
     Examples:
         >>> Scene(gravity=1.62).motor_limits
@@ -36,10 +39,14 @@ class Scene:
     free_fingers: bool = False
     motor_limits: bool = True
     motor_strength: float = 1.0
+    link_mass: float = 1.0
+    friction: float = 1.0
 
     def __post_init__(self) -> None:
         check_array("gravity", self.gravity, ())
-        check_positive(motor_strength=self.motor_strength)
+        check_positive(
+            motor_strength=self.motor_strength, link_mass=self.link_mass, friction=self.friction
+        )
         check_flag(free_fingers=self.free_fingers, motor_limits=self.motor_limits)
         if self.motor_strength != 1 and not self.motor_limits:
             raise ValueError(
