@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from torchrl_safe._checks import check_array, check_flag, check_positive
+from torchrl_safe._checks import check_array, check_flag, check_positive, keep_numbers
 
 #: Duration of one physics substep, s.
 SUBSTEP = 1 / 240
@@ -81,9 +79,7 @@ class Camera:
     shadows: bool = False
 
     def __post_init__(self) -> None:
-        if np.array_equal(
-            check_array("eye", self.eye, (3,)), check_array("target", self.target, (3,))
-        ):
+        if (keep_numbers(self, "eye", 3) == keep_numbers(self, "target", 3)).all():
             raise ValueError(f"eye must not be where it looks, got {self.eye} for both.")
         check_positive(field_of_view=self.field_of_view)
         check_flag(shadows=self.shadows)
