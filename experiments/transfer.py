@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -237,48 +237,41 @@ def run(policy: str, condition: Condition, episodes: int, seed: int) -> dict[str
 
 
 def table(runs: Sequence[dict[str, Any]]) -> str:
-    """Returns a Markdown table: a row for each policy, success and costs under each condition.
+    """Returns a Markdown table: a row for each condition, success and costs of each policy.
 
     A cost above its limit is bold.
     """
     conditions = [*dict.fromkeys(run["condition"] for run in runs)]
-    policies = [*dict.fromkeys((run["policy"], run["task"]) for run in runs)]
-    cells = {(run["policy"], run["condition"]): run["evaluation"] for run in runs}
+    policies = dict.fromkeys((run["policy"], run["task"]) for run in runs)
+    figures = {(run["policy"], run["condition"]): run["evaluation"] for run in runs}
+    limits = {policy: SUITE[task].cost_limits for policy, task in policies}
+    shown = [", ".join(f"{n} {limit:g}" for n, limit in each.items()) for each in limits.values()]
     lines = [
-        "| policy | limits | " + " | ".join(conditions) + " |",
-        "|---" * (2 + len(conditions)) + "|",
+        f"| | {' | '.join(limits)} | within every limit |",
+        "|---" * (2 + len(limits)) + "|",
+        f"| limits | {' | '.join(shown)} | |",
     ]
-    for policy, task in policies:
-        limits = SUITE[task].cost_limits
-        shown = ", ".join(f"{name} {limit:g}" for name, limit in limits.items())
-        row = [_cell(cells[policy, condition], limits) for condition in conditions]
-        lines.append(f"| {policy} | {shown} | " + " | ".join(row) + " |")
-    within = [
-        sum(
-            all(
-                figures[f"cost/{cost}"][0] <= limit
-                for cost, limit in SUITE[task].cost_limits.items()
-            )
-            for policy, task in policies
-            if (figures := cells[policy, condition]) is not None
-        )
-        for condition in conditions
-    ]
-    asked = [sum(cells[policy, c] is not None for policy, _ in policies) for c in conditions]
-    counts = [f"{kept}/{of}" for kept, of in zip(within, asked, strict=True)]
-    lines.append("| within every limit | | " + " | ".join(counts) + " |")
+    for condition in conditions:
+        row = {name: figures[name, condition] for name in limits}
+        played = {name: each for name, each in row.items() if each is not None}
+        kept = sum(not _exceeded(each, limits[name]) for name, each in played.items())
+        cells = [_cell(each, limits[name]) for name, each in row.items()]
+        lines.append(f"| {condition} | {' | '.join(cells)} | {kept}/{len(played)} |")
     lines.append("\nSuccess; the mean of each cost, bold where it is above its limit.")
     return "\n".join(lines)
 
 
-def _cell(figures: dict[str, list[float]] | None, limits: Any) -> str:
+def _exceeded(figures: Mapping[str, Any], limits: Mapping[str, float]) -> list[str]:
+    return [name for name, limit in limits.items() if figures[f"cost/{name}"][0] > limit]
+
+
+def _cell(figures: Mapping[str, Any] | None, limits: Mapping[str, float]) -> str:
     if figures is None:
         return ""
-    costs = []
-    for name, limit in limits.items():
-        cost = figures[f"cost/{name}"][0]
-        costs.append(f"**{cost:.2f}**" if cost > limit else f"{cost:.2f}")
-    return f"{figures['success'][0]:.0%}; {', '.join(costs)}"
+    above = _exceeded(figures, limits)
+    costs = {name: f"{figures[f'cost/{name}'][0]:.2f}" for name in limits}
+    shown = [f"**{cost}**" if name in above else cost for name, cost in costs.items()]
+    return f"{figures['success'][0]:.0%}; {', '.join(shown)}"
 
 
 def main(config: Config) -> None:
