@@ -25,7 +25,8 @@ class Recording:
 
     def __init__(self, env: ArmEnv, steps: int) -> None:
         self._batch = batch = env._simulator._batch  # type: ignore[attr-defined]
-        self._advance, self._calls, self._next = batch.rollout, [], 0
+        self._advance, self._next = batch.rollout, 0
+        self._calls: list[tuple[int, np.ndarray, dict[str, Any]]] = []
         self._out: Any = None
 
         def record(nstep: int, control: np.ndarray, **options: Any) -> Any:
