@@ -27,6 +27,7 @@ extensions = [
     "links",
     "mathml",
     "names",
+    "tables",
 ]
 autosummary_generate = False  # The pages of reference/ are written by hand.
 autodoc_inherit_docstrings = False  # TorchRL and Gymnasium document their own.
