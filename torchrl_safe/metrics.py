@@ -40,7 +40,14 @@ Resampled = Literal["episodes", "seeds"]
 
 
 class Estimate(NamedTuple):
-    """An estimate and the ends of its confidence interval, each of shape ``(k,)``."""
+    """An estimate and the ends of its confidence interval, each of shape ``(k,)``.
+
+    Examples:
+        >>> estimate = share(torch.ones(100, 1, dtype=torch.bool))
+        >>> round(estimate.value.item(), 2), round(estimate.low.item(), 2)
+        (1.0, 0.96)
+        >>> value, low, high = estimate
+    """
 
     value: Tensor
     low: Tensor

@@ -53,6 +53,13 @@ class Policy:
         weights (dict): ``state_dict`` of the actor that was saved. To train it further, make the
             actor again and call ``actor.load_state_dict(policy.weights)``.
         settings (dict): what was given to :func:`save_policy`.
+
+    Examples:
+        >>> policy = load_policy("panda-reach-in-front")
+        >>> policy
+        Policy('observation' (40,) -> 'action' (3,))
+        >>> policy(np.zeros(40)).shape, policy(np.zeros((8, 40))).shape
+        ((3,), (8, 3))
     """
 
     def __init__(self, contents: Mapping[str, Any]) -> None:
@@ -250,7 +257,11 @@ def load_policy(path: str | Path) -> Policy:
             while True:
                 robot.send(policy(robot.observation()))
 
-        See :func:`save_policy` for an example that runs.
+        A policy that comes with the package:
+
+        >>> policy = load_policy("panda-reach-in-front")
+        >>> policy(np.zeros(policy.observation_shape)).shape
+        (3,)
     """
     chosen, shipped = Path(path), shipped_policies()
     if not chosen.is_file():
@@ -269,6 +280,14 @@ def shipped_policies() -> dict[str, dict[str, Any]]:
     A card has the ``task``, its ``cost_limits``, what episodes of the deterministic policy have
     shown (``success``, ``return``, and each cost; estimates with the ends of their 95 % confidence
     intervals), and how it was ``trained``.
+
+    Examples:
+        >>> card = shipped_policies()["panda-reach-in-front"]
+        >>> card["task"], card["cost_limits"]
+        ('panda-reach-in-front', {'collision': 0.5})
+        >>> mean, low, high = card["cost/collision"]
+        >>> low <= mean <= high
+        True
     """
     files = sorted(_SHIPPED.glob("*.json"))
     return {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files}

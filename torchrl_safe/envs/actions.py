@@ -22,6 +22,22 @@ class ActionMode(Protocol):
     The motors' targets move evenly over the substeps of the control step, from where the joints
     are to what :meth:`targets` returns. The joints are there at its end, where their efforts and
     speeds allow, with every physics engine.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> class Lift:
+        ...     bound, moves_fingers = 1.0, False
+        ...
+        ...     def width(self, num_joints):
+        ...         return 1
+        ...
+        ...     def targets(self, action, state, simulator):
+        ...         up = np.pad(action, [(0, 0), (2, 0)])  # (N, 3): along z only
+        ...         return CartesianDelta().targets(up, state, simulator)
+        >>> env = ArmEnv(action=Lift(), num_envs=4)
+        >>> env.action_spec.shape
+        torch.Size([4, 1])
+        >>> env.close()
     """
 
     @property

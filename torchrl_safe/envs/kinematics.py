@@ -17,7 +17,18 @@ _ITERATIONS, _ARRIVED, _LONGEST_STEP, _DAMPING = 100, 0.005, 0.1, 1e-3
 
 
 class InverseKinematics(Protocol):
-    """Turns tool poses into joint angles."""
+    """Turns tool poses into joint angles.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, CartesianDelta
+        >>> def half_way(position, orientation, state, simulator):
+        ...     joints = DampedLeastSquares()(position, orientation, state, simulator)
+        ...     return (joints + state.joint_position) / 2
+        >>> env = ArmEnv(action=CartesianDelta(inverse_kinematics=half_way))
+        >>> env.rollout(2)["action"].shape
+        torch.Size([1, 2, 3])
+        >>> env.close()
+    """
 
     def __call__(
         self, position: Array, orientation: Array, state: ArmState, simulator: Simulator

@@ -92,7 +92,15 @@ class FullObservation:
 
 
 def paper_observation(state: ArmState) -> dict[str, Array]:
-    """The eight numbers of Kovač & Farkaš 2023: tool point, both fingers, target, all in m."""
+    """The eight numbers of Kovač & Farkaš 2023: tool point, both fingers, target, all in m.
+
+    Examples:
+        >>> from torchrl_safe.envs import paper_env
+        >>> env = paper_env()
+        >>> env.observation_fields
+        {'ee_position': slice(0, 3, None), 'finger_position': slice(3, 5, None), 'goal': slice(5, 8, None)}
+        >>> env.close()
+    """
     return {
         "ee_position": state.ee_position,
         "finger_position": state.finger_position,

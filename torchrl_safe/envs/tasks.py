@@ -27,7 +27,26 @@ _ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 0.5
 
 @runtime_checkable
 class Task(Protocol):
-    """Protocol of a task: objects to move, goals, reward and success."""
+    """Protocol of a task: objects to move, goals, reward and success.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, NoObstacles
+        >>> class StayAbove:
+        ...     objects = ()
+        ...
+        ...     def sample(self, rng, goals):
+        ...         return goals.sample(rng), np.zeros((0, 3))
+        ...
+        ...     def reward(self, state):
+        ...         return -np.linalg.norm((state.goal - state.ee_position)[:, :2], axis=1)
+        ...
+        ...     def success(self, state):
+        ...         return np.zeros(len(state.goal), dtype=bool)  # The time limit ends the episode.
+        >>> env = ArmEnv(task=StayAbove(), obstacles=NoObstacles())
+        >>> env.rollout(3)["next", "reward"].shape
+        torch.Size([1, 3, 1])
+        >>> env.close()
+    """
 
     @property
     def objects(self) -> tuple[Shape, ...]:

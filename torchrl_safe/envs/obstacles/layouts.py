@@ -98,7 +98,21 @@ class Placement:
 
 @runtime_checkable
 class Obstacles(Protocol):
-    """Protocol of a layout of obstacles: their shapes, and where they are in an episode."""
+    """Protocol of a layout of obstacles: their shapes, and where they are in an episode.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, Box
+        >>> class Gate:
+        ...     shapes = (Box((0.02, 0.02, 0.15)),) * 2
+        ...
+        ...     def sample(self, rng, start, goal):
+        ...         beside = np.array([[0, -0.15, 0], [0, 0.15, 0]])
+        ...         return Placement(np.array([goal[0], goal[1], 0.15]) + beside)
+        >>> env = ArmEnv(obstacles=Gate())
+        >>> env.reset()["observation"].shape
+        torch.Size([1, 57])
+        >>> env.close()
+    """
 
     @property
     def shapes(self) -> tuple[Shape, ...]:

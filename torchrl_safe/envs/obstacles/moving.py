@@ -25,7 +25,18 @@ def _unit(direction: tuple[float, float, float] | None, across: Array) -> Array:
 
 @runtime_checkable
 class Motion(Protocol):
-    """Protocol of a motion for :class:`Moving`."""
+    """Protocol of a motion for :class:`Moving`.
+
+    Examples:
+        >>> class Away:
+        ...     def sample(self, rng, across):
+        ...         speed = rng.uniform(0.05, 0.1)  # m/s
+        ...         return lambda times: speed * times[:, None] * across
+        >>> layout = Moving(motion=Away())
+        >>> displacement = Away().sample(np.random.default_rng(0), np.array([0.0, 1.0, 0.0]))
+        >>> displacement(np.array([0.0, 1.0])).shape
+        (2, 3)
+    """
 
     def sample(self, rng: np.random.Generator, across: Array) -> Callable[[Array], Array]:
         """Draws one obstacle's motion: maps times, s, ``(s,)``, to displacements, m, ``(s, 3)``.

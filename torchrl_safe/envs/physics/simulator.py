@@ -201,7 +201,14 @@ class Simulator(Protocol):
 
 @runtime_checkable
 class Physics(Protocol):
-    """A physics engine with its options: a frozen object, which can be copied and pickled."""
+    """A physics engine with its options: a frozen object, which can be copied and pickled.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, Bullet
+        >>> isinstance(Bullet(), Physics)
+        True
+        >>> ArmEnv(physics=Bullet()).close()
+    """
 
     def build(
         self,

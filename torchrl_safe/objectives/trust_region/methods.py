@@ -30,6 +30,14 @@ class TrustRegionProblem:
         natural_cost_gradient (Tensor): :math:`H^{-1} b`, shape ``(n,)``.
         violation (float): :math:`c`, cost minus limit in the unit of the cost surrogate.
         product (callable): from a vector :math:`x` of shape ``(n,)`` to :math:`H x`.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives import TRPO
+        >>> gradient, zero = torch.tensor([3.0, 4.0]), torch.zeros(2)
+        >>> problem = TrustRegionProblem(gradient, gradient, 0.02, zero, zero, 0.0, lambda x: x)
+        >>> TRPO()(problem).step  # Along the gradient, of length sqrt(2 * 0.02).
+        tensor([0.1200, 0.1600])
     """
 
     gradient: Tensor
@@ -49,6 +57,11 @@ class TrustRegionSolution:
         step (Tensor): change of the parameters, shape ``(n,)``.
         constraint_active (bool): whether the cost constraint shaped it.
         recovery (bool): whether it only lowers the cost, so that no gain is asked of it.
+
+    Examples:
+        >>> import torch
+        >>> TrustRegionSolution(step=torch.zeros(2)).recovery
+        False
     """
 
     step: Tensor
