@@ -97,8 +97,8 @@ def paper_observation(state: ArmState) -> dict[str, Array]:
     Examples:
         >>> from torchrl_safe.envs import paper_env
         >>> env = paper_env()
-        >>> env.observation_fields
-        {'ee_position': slice(0, 3, None), 'finger_position': slice(3, 5, None), 'goal': slice(5, 8, None)}
+        >>> list(env.observation_fields)
+        ['ee_position', 'finger_position', 'goal']
         >>> env.close()
     """
     return {
