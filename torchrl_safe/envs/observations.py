@@ -14,8 +14,8 @@ from torchrl_safe.envs.state import ArmState, Array
 class FullObservation:
     """Observes where everything is and how it moves, for any arm, task and obstacles.
 
-    With obstacles at rest the task is then Markov. The plans of moving obstacles stay hidden: when
-    a patrol turns round, or what a person reaches for next.
+    The task is Markov if obstacles are at rest. The plans of moving obstacles stay hidden, such as
+    when a patrol turns round, or what a person reaches for next.
 
     The fields, in order; those of free fingers and objects are empty where there are none:
 
@@ -31,9 +31,9 @@ class FullObservation:
     are all zeros.
 
     Args:
-        nearest: number of obstacles that are seen, those whose centres are nearest to the tool
-            point first; filled up with zeros where a world has fewer. A policy then fits any
-            number of obstacles. ``None`` shows all, in their own order.
+        nearest: number of obstacles to show: those whose centres are nearest to the tool point,
+            nearest first, and zeros where a world has fewer. A policy then fits any number of
+            obstacles. ``None`` shows all, in their own order.
 
     Raises:
         ValueError: if ``nearest`` is not a whole number of at least 1.

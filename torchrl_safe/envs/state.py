@@ -144,13 +144,13 @@ class ArmState:
         step: control steps since the episode began, int, ``(N,)``; 0 after a reset.
         time: simulated time since the episode began, s, ``(N,)``.
         trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
-        previous: the state in which the control step began, without its own; ``None`` where a
-            reset was the last thing that happened.
+        previous: the state at the beginning of the control step, whose own ``previous`` is ``None``;
+            ``None`` after a reset.
         shield_correction: how far the joint targets of the last control step were from those that
             the action asked for, rad, ``(N,)``: the length of the difference. 0 after a reset;
-            None without a :class:`~torchrl_safe.envs.Shield`.
+            ``None`` without a :class:`~torchrl_safe.envs.Shield`.
         shield_braked: in which worlds the shield held the arm still because nothing else was safe,
-            bool, ``(N,)``. None without a shield.
+            bool, ``(N,)``. ``None`` without a shield.
 
     Examples:
         >>> from torchrl_safe.envs import ArmEnv

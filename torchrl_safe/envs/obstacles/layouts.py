@@ -131,7 +131,7 @@ class Obstacles(Protocol):
             goal: target position, m, shape ``(3,)``.
 
         Raises:
-            NoRoomError: if they find no room here. The environment draws another goal.
+            NoRoomError: if there is no room for them. The environment then draws another goal.
         """
 
 
@@ -160,8 +160,8 @@ class InFront:
         gap: horizontal distance between the target and the obstacle's centre, m.
         shape: the obstacle.
         direction: horizontal direction in which the obstacle is passed on the way to the
-            target. ``None`` takes that from start to target, so that the obstacle always
-            stands in the way.
+            target. ``None`` takes the direction from start to target, so that the obstacle is
+            always in the way.
         height: height of the obstacle's centre, m. ``None`` stands it on the table.
 
     Raises:

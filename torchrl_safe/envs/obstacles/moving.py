@@ -87,12 +87,12 @@ class Swing:
 
 @dataclass(frozen=True)
 class Patrol:
-    """Back and forth at constant speed, from a random point of the way.
+    """Back and forth at constant speed, from a random point of the path.
 
     Args:
-        distance: length of the way, m; its middle is where the layout puts the obstacle.
+        distance: length of the path, m; its middle is where the layout puts the obstacle.
         speed: m/s.
-        direction: of the way; its length does not matter. ``None`` takes the horizontal across
+        direction: of the path; its length does not matter. ``None`` takes the horizontal across
             the way from start to goal.
 
     Raises:
@@ -125,9 +125,9 @@ class Patrol:
 
 @dataclass(frozen=True)
 class Moving:
-    """Any layout, in motion. The obstacles follow their way whatever they hit.
+    """Any layout, in motion. The obstacles keep to their paths and yield to nothing.
 
-    Only their places at the start are checked to leave the arm at home and the objects free.
+    Only their places at the start are checked: they leave the arm at home and the objects free.
 
     Args:
         layout: where the obstacles are; must be fixed shapes (mass 0).
