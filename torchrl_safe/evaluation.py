@@ -30,8 +30,8 @@ def evaluate(
 ) -> TensorDict:
     """Plays episodes with the deterministic policy.
 
-    Each environment of a batch plays one episode from start to end, as often as needed. (The first
-    episodes to end, which TorchRL's ``Evaluator`` takes, are the short ones.)
+    Each environment of a batch plays whole episodes, one after the other. (TorchRL's ``Evaluator``
+    takes the first episodes that end, which are the short ones.)
 
     Args:
         env (EnvBase): environment, batched or not, with a ``reward`` and a ``cost``. A cost that

@@ -28,7 +28,7 @@ from torchrl_safe._program import Program, record
 
 __all__ = ["Policy", "load_policy", "save_policy", "shipped_policies"]
 
-#: What a file of ours says it is; the number rises when its contents change.
+#: The mark of our files, and the version of their contents.
 _FORMAT, _VERSION = "torchrl-safe policy", 2
 # The policies that come with the package, each with a card beside it that says how good it is.
 _SHIPPED = Path(__file__).parent / "policies"
@@ -80,7 +80,7 @@ class Policy:
             raise ValueError(f"the policy must give one action for each observation, got {action}.")
         self.action_shape = tuple(action.shape[1:])
         self.action_dtype = action.numpy().dtype
-        # What PyTorch does only once, it does here and not at a robot's first deadline.
+        # PyTorch does some work in the first call: do it here, not at a robot's first deadline.
         for observation in (example[0], example, example.expand(2, *self.observation_shape)):
             self(observation.numpy())
 
@@ -113,7 +113,7 @@ class Policy:
             raise ValueError(f"observation must be finite, got {given}.")
         rows = torch.from_numpy(np.array(given, dtype=self.observation_dtype))
         with torch.no_grad():
-            # A copy: an action that is a constant must not be changed by whoever gets it.
+            # A copy, so that nobody can change an action that is a constant.
             return np.array(self.actor.module(rows).numpy())
 
     def __repr__(self) -> str:
@@ -189,7 +189,7 @@ def save_policy(
     actor = copy.deepcopy(actor).cpu().eval()
     weights = {name: _own(value) for name, value in actor.state_dict().items()}
     function = _Deterministic(actor, observation_key, action_key)
-    # The caller's random numbers stay what they would have been.
+    # Leave the caller's random numbers alone.
     with (
         torch.random.fork_rng(devices=[]),
         set_exploration_type(ExplorationType.DETERMINISTIC),
@@ -222,7 +222,7 @@ def save_policy(
     file = io.BytesIO()
     torch.save(contents, file)
     policy = _read(file, "actor and settings must be such that the file can be read again")
-    # Python code that chooses what to do by what it sees is recorded with one choice.
+    # Python code that branches on its input is recorded with one branch only.
     for seen, expected in ((rows, action), (rows[:1], first)):
         again = torch.from_numpy(policy(seen.numpy()))
         if not torch.allclose(again.double(), expected.double(), rtol=1e-4, atol=1e-5):
@@ -297,7 +297,7 @@ def _read(file: IO[bytes], wanted: str) -> Policy:
     file.seek(0)
     try:
         contents = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # A file that is not PyTorch's makes it fail anywhere.
+    except Exception as error:  # A file that is not PyTorch's can raise any error.
         raise ValueError(f"{wanted}: {error}") from error
     if not isinstance(contents, dict) or contents.get("format") != _FORMAT:
         raise ValueError(f"{wanted}: it holds something else.")

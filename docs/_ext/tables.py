@@ -17,7 +17,9 @@ def keep_together(app: Sphinx, doctree: nodes.document, page: str) -> None:
     for cell in doctree.findall(nodes.entry):
         for text in list(cell.findall(nodes.Text)):
             if not isinstance(text.parent, nodes.literal):
-                text.parent.replace(text, nodes.Text(BETWEEN_NUMBERS.sub("\N{NO-BREAK SPACE}", text)))
+                text.parent.replace(
+                    text, nodes.Text(BETWEEN_NUMBERS.sub("\N{NO-BREAK SPACE}", text))
+                )
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

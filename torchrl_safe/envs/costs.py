@@ -329,8 +329,8 @@ class ShieldCorrection:
     .. math::
         c = |q_\text{executed} - q_\text{asked}|
 
-    with q the joint targets (rad) of the control step. Limit it to train a policy that does not rely
-    on the :class:`~torchrl_safe.envs.Shield` and is safe without it.
+    with q the joint targets (rad) of the control step. Limit it to train a policy that does not
+    rely on the :class:`~torchrl_safe.envs.Shield` and is safe without it.
 
     Args:
         margin: corrections up to this size cost nothing, rad.

@@ -15,7 +15,8 @@ from torchrl_safe.envs.physics.simulator import Physics, Simulator
 from torchrl_safe.envs.state import Array
 
 # The search has arrived within this distance (m) and angle (rad). Below this singular value of the
-# Jacobian the arm has lost a direction: a tool motion of 1 m/s or 1 rad/s takes 50 rad/s of a joint.
+# Jacobian the arm has lost a direction: a tool motion of 1 m/s or 1 rad/s takes 50 rad/s of a
+# joint.
 _ARRIVED, _SINGULAR = 1e-3, 0.02
 # Further starts for a point that the search from home has not found.
 _STARTS = 20

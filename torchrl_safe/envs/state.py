@@ -144,8 +144,8 @@ class ArmState:
         step: control steps since the episode began, int, ``(N,)``; 0 after a reset.
         time: simulated time since the episode began, s, ``(N,)``.
         trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
-        previous: the state at the beginning of the control step, whose own ``previous`` is ``None``;
-            ``None`` after a reset.
+        previous: the state at the beginning of the control step, whose own ``previous`` is
+            ``None``; ``None`` after a reset.
         shield_correction: how far the joint targets of the last control step were from those that
             the action asked for, rad, ``(N,)``: the length of the difference. 0 after a reset;
             ``None`` without a :class:`~torchrl_safe.envs.Shield`.

@@ -130,17 +130,17 @@ class Push:
     takes longer than reaching: give the environment ``max_episode_steps=60``, or 200 where the cube
     has to go round an obstacle.
 
-    The reward of a step is the progress :math:`(w - w') / \text{radius}`, where w and w' are what is
-    left to do before and after it. With the object at o, the goal at g and the tool at t,
+    The reward of a step is the progress :math:`(w - w') / \text{radius}`, where w and w' are what
+    is left to do before and after it. With the object at o, the goal at g and the tool at t,
 
     .. math::
         w = |o - g| + |t - b|
 
     where b is behind the object, seen from the goal, and at its upper half: panda-gym's dense
-    reward :math:`-|o - g|` does not change before the first touch. At success w' is 0. Progress is potential-based shaping (Ng et al. 1999),
-    :math:`\gamma \Phi(s') - \Phi(s)` with :math:`\Phi = -w / \text{radius}`, of the reward
-    :math:`-(1 - \gamma) w' / \text{radius}`, for every discount :math:`\gamma`: the same policies
-    are best with and without it, and a critic has less to learn.
+    reward :math:`-|o - g|` does not change before the first touch. At success w' is 0. Progress is
+    potential-based shaping (Ng et al. 1999), :math:`\gamma \Phi(s') - \Phi(s)` with :math:`\Phi =
+    -w / \text{radius}`, of the reward :math:`-(1 - \gamma) w' / \text{radius}`, for every discount
+    :math:`\gamma`: the same policies are best with and without it, and a critic has less to learn.
 
     Args:
         region: where the cube and its goal are drawn, uniformly; heights do not matter. ``None``
@@ -211,8 +211,9 @@ class PickAndPlace:
     those of panda-gym's PandaPickAndPlace (Gallouédec et al. 2021, arXiv 2106.13687); success
     ends the episode (``terminated``). As in :class:`Push`, the cube never starts near its goal.
     It weighs 0.1 kg instead of 1 kg: panda-gym's fingers press with 170 N, a Panda's URDF allows
-    20 N, and 1 kg slips from such fingers when the arm starts to move fast. The action must move the
-    fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs ``max_episode_steps=100``.
+    20 N, and 1 kg slips from such fingers when the arm starts to move fast. The action must move
+    the fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs
+    ``max_episode_steps=100``.
 
     The reward of a step is the progress, as in :class:`Push`, and 10 more at success, with
 

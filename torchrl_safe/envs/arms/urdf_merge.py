@@ -14,8 +14,9 @@ _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 def merge_fixed_links(root: Element, keep: str) -> None:
     """Merges every link that a fixed joint holds into the link that holds it.
 
-    The merged link has all shapes, and the sum of masses and inertias. It is the same body, cheaper to
-    simulate. (An engine that takes the inertia of the box around a link's shapes gets another one.)
+    The merged link has all shapes, and the sum of masses and inertias. It is the same body, cheaper
+    to simulate. (An engine that takes the inertia of the box around a link's shapes gets another
+    one.)
 
     Args:
         root: a URDF; changed in place.

@@ -240,8 +240,8 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
             environment without a batch dimension. (TorchRL's ``num_workers`` has no effect here;
             use :class:`~torchrl.envs.ParallelEnv`.)
         asynchronous (bool, optional): with ``num_envs``, whether each environment has a process of
-            its own. If not, they step one after the other in this process, which is faster if a step
-            takes less than about a millisecond. Defaults to ``True``.
+            its own. If not, they step one after the other in this process, which is faster if a
+            step takes less than about a millisecond. Defaults to ``True``.
         **kwargs: arguments of :class:`~torchrl.envs.GymEnv` and of the environment.
 
     Examples:
