@@ -18,7 +18,7 @@ Constrain = Callable[[LossModule, Tensor], None]
 
 
 def set_multiplier(loss: LossModule, strength: Tensor) -> None:
-    """Puts a loss under constraint by its multipliers: they take the values of ``strength``.
+    """Sets the multipliers of a loss to ``strength``, shape ``(k,)``.
 
     Examples:
         >>> from torchrl_safe.objectives import PPOLagrangianLoss
@@ -32,10 +32,10 @@ def set_multiplier(loss: LossModule, strength: Tensor) -> None:
 
 
 def set_violation(loss: LossModule, strength: Tensor) -> None:
-    """Puts a loss that has no multipliers, as P3O, IPO and CRPO, under constraint.
+    """Sets the violations of a loss without multipliers, such as P3O, IPO and CRPO.
 
-    A cost with a strength above 0 exceeds its limit by that much; one with a strength of 0 is as
-    far below its limit as a number can be, so that there is nothing to do about it.
+    A cost with a ``strength`` above 0 exceeds its limit by that much. One with a strength of 0 is
+    so far below its limit that it has no effect.
 
     Examples:
         >>> from torchrl_safe.objectives import P3OLoss
