@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
 from itertools import product
-from time import perf_counter, process_time
+from time import perf_counter
 from typing import Any
-from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -17,9 +16,10 @@ import torch
 
 from benchmarks import bullet
 from benchmarks.anatomy import anatomy
+from benchmarks.bare import bare_batch, torchrl_alone
 from benchmarks.report import Figure
-from benchmarks.rollouts import Canned, episode, play, play_gym, rollout
-from benchmarks.timing import Contender, quartiles, race, ratio, timed
+from benchmarks.rollouts import episode, play_gym, rollout
+from benchmarks.timing import quartiles, race, ratio, timed
 from torchrl_safe.envs import (
     ActionMode,
     ArmEnv,
@@ -38,32 +38,6 @@ _ACTIONS: dict[str, ActionMode] = {"joint": JointDelta(), "Cartesian": Cartesian
 _AT_LEAST = {1: 4.0, 12: 3.0}
 _ENDLESS = 10**9
 _PANDA_GYM_SUBSTEPS, _PANDA_GYM_EPISODE = 20, 50
-
-
-def bare_batch(env: ArmEnv, steps: int) -> Contender:
-    """The same model, controls and sensors as in :func:`rollout`, in MuJoCo's own batch."""
-    batch, policy = env._simulator._batch, Canned(env, steps)  # type: ignore[attr-defined]
-    advance, calls = batch.rollout, []
-
-    def record(nstep: int, control: np.ndarray, **options: Any) -> Any:
-        calls.append((nstep, control.copy(), {**options, "out": None}))
-        return advance(nstep, control, **options)
-
-    env.set_seed(0)
-    start = env.reset()
-    state = batch.state.copy()
-    with mock.patch.object(batch, "rollout", record):
-        play(env, policy, steps, start)
-
-    def contender() -> float:
-        batch.state[:] = state
-        out = None
-        begin = process_time()
-        for nstep, control, options in calls:
-            out = advance(nstep, control, **{**options, "out": out})
-        return process_time() - begin
-
-    return contender
 
 
 def against_bullet(quick: bool) -> Iterator[Figure]:
@@ -113,11 +87,15 @@ def parts_of_a_step(quick: bool) -> Iterator[Figure]:
     for name, action in _ACTIONS.items():
         settings: dict[str, Any] = {"action": action, "max_episode_steps": _ENDLESS}
         with closing(ArmEnv(num_envs=worlds, physics=MuJoCo(1), **settings)) as env:
-            runs = [anatomy(env, steps) for _ in range(rounds)][1:]
+            alone = torchrl_alone(env, steps)
+            turns = [(anatomy(env, steps), alone()) for _ in range(rounds)][1:]
+            runs, floor = zip(*turns, strict=True)
         times = {part: 1e3 * np.array([run[part] for run in runs]) for part in runs[0]}
         case = f"{name}, substeps 12, {worlds} worlds, a step of MuJoCo"
         beside = sum(times.values()) - times["physics"]
         yield quartiles(f"{case} beside physics", beside, "ms", at_most=1)
+        floor_name = f"{name}, substeps 12, {worlds} worlds, a step of an empty environment"
+        yield quartiles(f"{floor_name} beside physics", 1e3 * np.array(floor), "ms")
         yield from (quartiles(f"{case}: {part}", spent, "ms") for part, spent in times.items())
 
 

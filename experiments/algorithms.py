@@ -18,7 +18,7 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, LossModule, V
 from experiments.agent import make_agent, make_q_agent, num_costs
 from experiments.compiling import compiled
 from experiments.config import Config
-from experiments.learners import Learner, NoiseSchedule, OnPolicyLearner, ReplayLearner
+from experiments.learners import Learner, NoiseSchedule, OnPolicyLearner, ReplayLearner, summed
 from torchrl_safe.envs import EarlyTermination, Saute, Shield
 from torchrl_safe.objectives import (
     CPO,
@@ -160,10 +160,10 @@ class OnPolicy:
         epochs = self.epochs or config.epochs
         steps = batches * epochs * math.ceil(config.frames_per_batch / config.minibatch)
         # Where a trust-region step moves the actor, the optimizer has the critics only.
-        objective = loss if step is None else loss.critic_losses
+        objective = summed(loss if step is None else loss.critic_losses)
         phases = [(None, compiled(objective, steps) if self.compiles else objective)]
         if self.projects:
-            phases.append((loss.start_projection, loss.projection_loss))
+            phases.append((loss.start_projection, summed(loss.projection_loss)))
         learner = OnPolicyLearner(
             loss,
             agent.actor,

@@ -22,7 +22,7 @@ def compiled(loss: Callable[..., Result], gradient_steps: int) -> Callable[..., 
     Compiled kernels round in another way than PyTorch's own: the same seed gives another run.
 
     Args:
-        loss: a loss of TorchRL, or one of its methods.
+        loss: a function of a minibatch.
         gradient_steps: how often it will be called.
 
     Returns:

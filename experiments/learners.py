@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.data import (
     LazyTensorStorage,
     RandomSampler,
@@ -17,7 +18,19 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_safe.objectives import TrustRegionStep
 
-Loss = Callable[[TensorDictBase], TensorDictBase]
+# What a loss does not read once there are advantages; left out, minibatches are cut faster.
+NOT_LEARNT_FROM = (
+    "next",
+    "done",
+    "terminated",
+    "truncated",
+    "success",
+    "episode_reward",
+    "episode_cost",
+    ("collector", "traj_ids"),
+)
+# What is minimized: a number for a minibatch.
+Objective = Callable[[TensorDictBase], Tensor]
 
 
 class Learner(Protocol):
@@ -31,6 +44,15 @@ class Learner(Protocol):
 
     def memory(self) -> dict[str, Any]:
         """What else it needs to go on learning."""
+
+
+def summed(loss: Callable[[TensorDictBase], TensorDictBase]) -> Objective:
+    """A loss as the one number that is minimized."""
+
+    def total(minibatch: TensorDictBase) -> Tensor:
+        return sum(value for key, value in loss(minibatch).items() if key.startswith("loss_"))
+
+    return total
 
 
 class NoiseSchedule:
@@ -86,7 +108,7 @@ class OnPolicyLearner:
         batches: int,
         epochs: int,
         minibatch: int,
-        phases: Sequence[tuple[Callable[[], None] | None, Loss]],
+        phases: Sequence[tuple[Callable[[], None] | None, Objective]],
         actor_step: TrustRegionStep | None = None,
     ) -> None:
         self.loss, self.noise, self.actor_step = loss, noise, actor_step
@@ -107,14 +129,15 @@ class OnPolicyLearner:
         data = self.loss.estimate_advantages(batch).reshape(-1)
         if self.actor_step is not None:
             self.actor_step.step(data)
-        # All that the losses read of the next steps is in the advantages.
-        data = data.exclude("next")
-        for prepare, loss in self.phases:
+        data = data.exclude(*NOT_LEARNT_FROM)
+        for prepare, objective in self.phases:
             if prepare is not None:
                 prepare()
-            for _ in range(self.epochs):
-                for minibatch in data[torch.randperm(len(data))].split(self.minibatch):
-                    _descend(loss, minibatch, self.optimizer, self.policy)
+            for epoch in range(self.epochs):
+                # What was compiled is for the same in all passes: the first checks it.
+                with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
+                    for minibatch in data[torch.randperm(len(data))].split(self.minibatch):
+                        _descend(objective(minibatch), self.optimizer, self.policy)
         self.schedule.step()
         self.noise.step()
 
@@ -155,6 +178,7 @@ class ReplayLearner:
     ) -> None:
         self.loss, self.steps_per_update = loss, steps_per_update
         self.targets = SoftUpdate(loss, tau=0.005)
+        self.objective = summed(loss)
         self.policy = list(actor.parameters())
         self.optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate, fused=True)
         self.buffer = TensorDictReplayBuffer(
@@ -164,7 +188,7 @@ class ReplayLearner:
     def learn(self, batch: TensorDictBase) -> None:
         self.buffer.extend(batch.reshape(-1))
         for _ in range(batch.numel() // self.steps_per_update):
-            _descend(self.loss, self.buffer.sample(), self.optimizer, self.policy)
+            _descend(self.objective(self.buffer.sample()), self.optimizer, self.policy)
             self.targets.step()
 
     def state(self) -> dict[str, Any]:
@@ -175,13 +199,9 @@ class ReplayLearner:
 
 
 def _descend(
-    loss: Loss,
-    minibatch: TensorDictBase,
-    optimizer: torch.optim.Optimizer,
-    policy: list[torch.nn.Parameter],
+    loss: Tensor, optimizer: torch.optim.Optimizer, policy: list[torch.nn.Parameter]
 ) -> None:
-    losses = loss(minibatch)
-    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    loss.backward()
     # One step with NaN and all that was learnt is lost: rather none, and an error.
     moved = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     gradients = [parameter.grad for parameter in moved if parameter.grad is not None]

@@ -104,10 +104,10 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
         for axis, key in zip(grid[0], keys, strict=True):
             ends = []
             for name, run in runs.items():
-                frames, values = zip(
-                    *((row["frames"], row[key]) for row in run["history"] if key in row),
-                    strict=True,
-                )
+                points = [(row["frames"], row[key]) for row in run["history"] if key in row]
+                if not points:  # No episode has ended.
+                    continue
+                frames, values = zip(*points, strict=True)
                 middle = values if key.startswith("summed/") else running_mean(values)
                 axis.plot(frames, values, color=colour(name), lw=0.8, alpha=0.35)
                 axis.plot(frames, middle, color=colour(name), lw=1.8)
@@ -121,7 +121,7 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
             elif kind == "summed":
                 # From none to thousands.
                 cost_axis(axis, "y", max(end[1] for end in ends))
-            axis.set_xlim(0, 1.02 * max(end[0] for end in ends))
+            axis.set_xlim(0, 1.02 * max((end[0] for end in ends), default=1))
             figure.canvas.draw()
             label_ends(axis, ends)
         figure.savefig(path)

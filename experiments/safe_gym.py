@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from time import strftime
@@ -35,6 +35,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
 from experiments.compiling import compiled
 from experiments.files import is_new, write_whole
+from experiments.learners import NOT_LEARNT_FROM, summed
 from experiments.log import Log, figures, versions
 from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.envs.gym import SafeGymEnv
@@ -49,8 +50,6 @@ from torchrl_safe.policy import save_policy
 
 # What may be another when a run is resumed: it changes nothing in what is learnt.
 CHANGEABLE = ("out", "logger", "resume", "eval_episodes")
-# What a loss does not read once there are advantages; left out, minibatches are cut faster.
-NOT_LEARNT_FROM = ("next", "done", "terminated", "truncated", "episode_reward", "episode_cost")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -312,15 +311,6 @@ def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | Violat
     if wanted is move_multiplier:
         return PIDControl(loss, cost_limit=limits)
     return ViolationUpdater(loss, cost_limit=limits)
-
-
-def summed(loss: Callable[..., TensorDictBase]) -> Callable[[TensorDictBase], Tensor]:
-    """A loss as the one number that is minimized."""
-
-    def total(minibatch: TensorDictBase) -> Tensor:
-        return sum(value for key, value in loss(minibatch).items() if key.startswith("loss_"))
-
-    return total
 
 
 class Learner:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from bullet_worlds import worlds_of
 
+from benchmarks.bare import Hollow, Recording
 from benchmarks.floor import Tape
 from benchmarks.handwritten import HandWritten, arguments
 from benchmarks.networks import make_actor, make_critic, make_minibatch
@@ -15,7 +16,7 @@ from benchmarks.original import OriginalEnv
 from benchmarks.parts import measure
 from benchmarks.report import Figure, record
 from benchmarks.timing import race, ratio, timed
-from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ArmEnv, paper_env
+from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ArmEnv, MuJoCo, paper_env
 from torchrl_safe.objectives import PPOLagrangianLoss
 
 
@@ -52,6 +53,18 @@ def test_parts_are_kept_and_replaced(tmp_path):
     table = (tmp_path / "table.md").read_text()
     assert "| fast | 2 x | 1.5 to 2.5 | at least 1.7 | met |" in table
     assert "old" not in table
+
+
+def test_an_empty_environment_takes_the_same_physics_steps():
+    env = ArmEnv(num_envs=2, frame_skip=3, physics=MuJoCo(threads=1))
+    recording, batch = Recording(env, 4), env._simulator._batch
+    after = batch.state.copy()
+    hollow = Hollow(env, recording)
+    rollout = hollow.rollout(4)
+    assert np.array_equal(batch.state, after)
+    assert hollow.seconds > 0
+    assert set(rollout.keys(True, True)) == set(env.rollout(1).keys(True, True))
+    env.close()
 
 
 def test_floor_moves_the_worlds_as_the_environment_did():

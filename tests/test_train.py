@@ -200,6 +200,12 @@ def test_curves_with_a_shield_show_the_sum(tmp_path):
     assert widths[1] == pytest.approx(1.5 * widths[0], abs=1)
 
 
+def test_a_run_without_a_finished_episode_has_empty_curves(tmp_path):
+    runs = {"ppo": {"history": [{"frames": 8, "summed/collision": 0.0}]}}
+    plot_curves({"algorithms": runs, "cost_limits": {"collision": 0.5}}, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").exists()
+
+
 def test_multiplier_rules():
     """A violation beyond a fifth of the limit counts as 1: the rate, and the gain of PID."""
     multiplier = {}
@@ -311,7 +317,7 @@ def test_each_epoch_sees_each_step_once():
     def objective(minibatch):
         assert "next" not in minibatch
         seen.append(minibatch["action"][:, 0].tolist())
-        return TensorDict(loss_objective=next(training.actor.parameters()).sum())
+        return next(training.actor.parameters()).sum()
 
     training.learner.phases = [(None, objective)]
     config = Config(envs=5, frames_per_batch=10, workers=1)

@@ -220,7 +220,8 @@ class ArmEnv(EnvBase):
     def _make_specs(self) -> None:
         for row in range(self.num_envs):
             self._reset_world(row, np.random.default_rng(0))
-        self._state = state = self._read_state()
+        # With the state before it, and without.
+        self._state = self._alone = state = self._read_state()
         # Checks once what the arguments compute, so that errors show when the environment is made.
         joints = state.joint_position.shape[1]
         width = self.action_mode.width(joints)
@@ -282,7 +283,7 @@ class ArmEnv(EnvBase):
         for row in rows:
             self._reset_world(int(row), self._generators[int(row)])
         self._begun = True
-        self._state = self._read_state()
+        self._state = self._alone = self._read_state()
         return self._pack(
             observation=self._observe(self._state),
             success=np.zeros((self.num_envs, 1), dtype=bool),
@@ -300,8 +301,8 @@ class ArmEnv(EnvBase):
         if self.shield is not None:
             joints, fingers = self._shielded(self.shield, joints, fingers)
         self._simulator.advance(joints, fingers)
-        before = replace(self._state, previous=None)
-        self._state = state = replace(self._read_state(), previous=before)
+        before, self._alone = self._alone, self._read_state()
+        self._state = state = replace(self._alone, previous=before)
         reward, cost, success = self._outcome(state)
         truncated = (state.step >= self.max_episode_steps)[:, None] & ~success
         return self._pack(
@@ -372,7 +373,7 @@ class ArmEnv(EnvBase):
         if self.shield is not None:
             for name, array in self._shield_state().items():
                 array[:] = arrays[name]
-        self._state = self._read_state()
+        self._state = self._alone = self._read_state()
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -425,7 +426,7 @@ class ArmEnv(EnvBase):
             raise ValueError(f"action must have shape {tuple(shape)}, got {tuple(action.shape)}.")
         if action.is_complex():
             raise ValueError(f"action must be real, got {action.dtype}.")
-        array = action.detach().cpu().numpy().astype(float)
+        array = action.numpy(force=True).astype(float)
         if not np.isfinite(array).all():
             rows = np.flatnonzero(~np.isfinite(array).all(axis=1)).tolist()
             raise ValueError(f"action must be finite, got NaN or infinity in rows {rows}.")

@@ -59,7 +59,7 @@ class FullObservation:
         relative = state.obstacle_position - tool
         obstacles = {
             "to_obstacle": relative,
-            "obstacle_size": np.broadcast_to(state.obstacle_size, relative.shape),
+            "obstacle_size": np.repeat(state.obstacle_size[None], rows, axis=0),
             "obstacle_orientation": _canonical(state.obstacle_orientation),
             "obstacle_velocity": state.obstacle_velocity,
             "obstacle_angular_velocity": state.obstacle_angular_velocity,
