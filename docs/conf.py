@@ -27,6 +27,7 @@ extensions = [
     "links",
     "mathml",
     "names",
+    "tables",
 ]
 autosummary_generate = False  # The pages of reference/ are written by hand.
 autodoc_inherit_docstrings = False  # TorchRL and Gymnasium document their own.
@@ -38,6 +39,7 @@ html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 napoleon_use_ivar = True
+napoleon_attr_annotations = False  # Descriptions have shapes and units; these would be long.
 # The order in which they are shown; those that it does not name come before the last two.
 TUTORIALS = [
     "first_policy.py",

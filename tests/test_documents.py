@@ -84,16 +84,16 @@ print(updater.cost_names, loss.lagrange_multiplier.shape)
 
 
 def test_quickstart(tmp_path):
-    env, loop, use = code_of("docs/start/quickstart.md")
+    env, loop, use, measure = code_of("docs/start/quickstart.md")
     assert env == code_of("README.md")[0]
-    assert len(loop.splitlines()) <= 40
+    assert len(loop.splitlines()) <= 44
     # The same program on fewer frames.
-    short = loop.replace("total_frames=256_000", "total_frames=4_096")
+    short = loop.replace("total_frames=102_400", "total_frames=4_096")
     assert short != loop
     script = tmp_path / "quickstart.py"
     script.write_text(short, encoding="utf-8")
     lines = re.findall(
-        r"cost \[(\S+)\] multiplier \[(\S+)\]",
+        r"return \S+ cost (\S+) multiplier (\S+)",
         run(script, tmp_path, strict=FutureWarning),
     )
     assert len(lines) == 2
@@ -102,7 +102,9 @@ def test_quickstart(tmp_path):
         assert float(shown) > 0 or float(cost) < 0.5
         assert float(shown) < 1.01 + 0.2 * batch
     assert max(float(shown) for _, shown in lines) > 0
-    script.write_text(f"import torch\n{use}print(action.shape)\n{DRIVE}", encoding="utf-8")
+    short = measure.replace("256", "32")
+    assert short != measure
+    script.write_text(f"import torch\n{use}{short}print(action.shape)\n{DRIVE}", encoding="utf-8")
     *moved, shape = run(script, tmp_path).splitlines()[-6:]
     assert shape == "(3,)"
     assert len({line for line in moved if line.startswith("moved by 0.")}) == 5
@@ -110,7 +112,7 @@ def test_quickstart(tmp_path):
 
 def test_several_limits(tmp_path):
     (code,) = code_of("docs/howto/several_limits.md")
-    short = code.replace("total_frames=256_000", "total_frames=2_048")
+    short = code.replace("total_frames=102_400", "total_frames=2_048")
     short = short.replace("range(10)", "range(1)")
     assert short.count("2_048") == short.count("range(1)") == 1
     script = tmp_path / "limits.py"
@@ -156,7 +158,7 @@ def test_deploying_a_policy(tmp_path):
     """What docs/howto/deploy.md does with a file, on few episodes."""
     actor = TensorDictModule(MLP(40, 3), ["observation"], ["action"])
     save_policy(tmp_path / "policy.pt", actor, Composite(observation=Unbounded(40)))
-    load, drive, measure = code_of("docs/howto/deploy.md")
+    load, drive, simulated, measure = code_of("docs/howto/deploy.md")
     short = measure.replace("num_envs=32", "num_envs=2").replace("256", "2")
     assert short != measure
     show = "print(action.shape, len(figures))\n"
@@ -167,15 +169,63 @@ def send_action(action): sent.append(action)
 def is_running(): return len(sent) < 4
 """
     pace = "print(len(sent), 0.15 <= time.perf_counter() - began)\n"
-    code = load + arm + drive + pace + short + show
+    code = load + arm + drive + pace + short + show + simulated
     (tmp_path / "deploy.py").write_text(code, encoding="utf-8")
-    assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-2:] == ["4 True", "(3,) 5"]
+    assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-3:] == [
+        "4 True",
+        "(3,) 5",
+        "reached: True, control steps in collision: 0.0",
+    ]
 
 
 def test_any_environment(tmp_path):
-    code = code_of("docs/safe_gym.md")[0]
-    (tmp_path / "oven.py").write_text(code, encoding="utf-8")
-    assert run(tmp_path / "oven.py").splitlines()[-1] == "torch.Size([3, 1])"
+    """The wrapped environment, then its loop on one batch."""
+    pendulum, loop = code_of("docs/safe_gym.md")[:2]
+    short = loop.replace("total_frames=122_880", "total_frames=4_096").replace(
+        "actor, 64", "actor, 16"
+    )
+    short = short.replace("range(10)", "range(1)")
+    assert short.count("4_096") == short.count("actor, 16") == short.count("range(1)") == 1
+    (tmp_path / "pendulum.py").write_text(pendulum + short, encoding="utf-8")
+    shape, *lines = (
+        line for line in run(tmp_path / "pendulum.py").splitlines() if "torchrl" not in line
+    )
+    assert shape == "torch.Size([3, 1])"
+    # Random torques, of which half are too large: the policy has the whole range of the motor.
+    assert 60 < float(re.fullmatch(r"cost (\S+) of 10", lines[0])[1]) < 160
+    assert "cost/torque" in lines[1]
+
+
+def test_short_blocks(tmp_path):
+    """Lines for a loop, on the networks and the batch of docs/algorithms.md."""
+    setting = code_of("docs/algorithms.md")[0] + (
+        "from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss\n"
+        "loss = PPOLagrangianLoss(actor, critic, cost_critic)\n"
+        "both = ValueOperator(torch.nn.Linear(4, 2), ['observation'], ['cost_value'])\n"
+        "two = PPOLagrangianLoss(actor, critic, both, num_costs=2)\n"
+        "updater = PIDControl(loss, cost_limit=0.5)\n"
+        "optimizer = torch.optim.Adam(loss.parameters())\n"
+    )
+    limits, discount = code_of("docs/howto/limit.md")
+    blocks = [
+        limits.replace("PIDControl(\n    loss", "PIDControl(\n    two"),
+        discount,
+        *code_of("docs/howto/multiplier_explodes.md"),
+        *code_of("docs/robustness.md"),
+        *code_of("docs/limits.md"),
+        *code_of("docs/speed.md"),
+    ]
+    script = tmp_path / "blocks.py"
+    script.write_text("\n".join([setting, *blocks]), encoding="utf-8")
+    run(script)
+
+
+def test_no_block_is_left_out():
+    """A page with code is named in this file, or in one of the folders that it goes through."""
+    named = set(re.findall(r'"((?:docs/[\w/]+|README)\.md)"', Path(__file__).read_text("utf-8")))
+    pages = {page.relative_to(ROOT).as_posix() for page in (ROOT / "docs").rglob("*.md")}
+    folders = ("docs/tasks/", "docs/algorithms/", "docs/_build/", "docs/tutorials/")
+    assert {page for page in pages if not page.startswith(folders) and code_of(page)} <= named
 
 
 def test_environments(tmp_path):

@@ -68,7 +68,7 @@ def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.fl
         raise ValueError(f"{name} must be numbers of shape {shape}, got {values!r}.") from error
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}.")
-    if not np.abs(array).max(initial=0) <= _LARGEST:  # What is not a number is not either.
+    if not np.abs(array).max(initial=0) <= _LARGEST:  # NaN is not finite either.
         raise ValueError(f"{name} must be finite, got {array}.")
     return array
 
@@ -92,5 +92,5 @@ def keep_numbers(part: Any, name: str, count: int) -> NDArray[np.float64]:
 def _is_finite(value: Any) -> bool:
     try:
         return isinstance(value, Real) and math.isfinite(value)
-    except OverflowError:  # Python's whole numbers go on where floats end.
+    except OverflowError:  # Python's integers can be larger than any float.
         return False

@@ -16,7 +16,7 @@ UNFINISHED = ".unfinished"
 def writing(path: Path) -> Iterator[IO[bytes]]:
     """Opens a file that gets its name only when it is complete and on the disk.
 
-    A program that is stopped leaves no half of it. What was there before stays until then.
+    A program that is stopped leaves no half-written file. The old file stays until then.
     """
     unfinished = path.with_name(path.name + UNFINISHED)
     try:

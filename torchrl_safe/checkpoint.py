@@ -25,22 +25,24 @@ class RunCheckpoints:
     """The checkpoints of one run: the last ones and the best, each a file of its own.
 
     TorchRL's :class:`~torchrl.checkpoint.Checkpoint` reads and writes them, and its
-    :class:`~torchrl.checkpoint.CheckpointRotation` chooses which to keep. This makes them safe:
+    :class:`~torchrl.checkpoint.CheckpointRotation` chooses which to keep. This class makes them
+    safe:
 
-    - A file has its name only once it is complete and on the disk: it is written under another
+    - A file gets its name only when it is complete and on the disk: it is written under another
       name, synced, then renamed. A process killed at any time leaves the last checkpoint intact.
     - :meth:`load` takes the newest checkpoint that is whole (every file in it has a checksum)
-      and of this run; it warns about those it passes over, and raises if none is left.
+      and of this run. It warns about those that it skips, and raises an error if none is left.
     - It reads tensors and plain values only, with ``weights_only``: loading runs no foreign code.
       (``Checkpoint.load`` alone unpickles what a foreign file may hold.)
 
     Args:
         folder (Path): folder of the checkpoints, which is made when the first is saved.
-        components (Mapping[str, Any]): what has ``state_dict`` and ``load_state_dict``, by name.
+        components (Mapping[str, Any]): objects with ``state_dict`` and ``load_state_dict``, by
+            name.
 
     Keyword Args:
-        settings (Mapping[str, Any], optional): what the run is made with, as JSON has it. A
-            checkpoint of a run with other settings is not loaded. Defaults to none.
+        settings (Mapping[str, Any], optional): settings of the run, as JSON values. A checkpoint
+            of a run with other settings is not loaded. Defaults to none.
         keep_last (int, optional): how many of the last checkpoints to keep. Defaults to ``2``:
             one to fall back on.
 
@@ -102,7 +104,7 @@ class RunCheckpoints:
             written = self._checkpoint.save(unfinished / path.name, metadata=metadata)
             _publish(written, path)
         except (OSError, RuntimeError) as error:
-            # That of torch.save says nothing of the disk.
+            # torch.save's error does not mention the disk.
             free = shutil.disk_usage(self.folder).free
             raise OSError(
                 f"Checkpoint {path} could not be written ({free:,} bytes are free there): {error}. "
@@ -132,7 +134,7 @@ class RunCheckpoints:
         for path in reversed(self._files()):
             try:
                 step = self._load(path, map_location)
-            except Exception as error:  # A torn file makes its readers stumble anywhere.
+            except Exception as error:  # A torn file can raise any error in its readers.
                 refused.append(f"{path}: {error}")
                 continue
             if refused:

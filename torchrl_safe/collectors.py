@@ -1,4 +1,4 @@
-"""A collector that can be stopped and go on as if it had not been."""
+"""A collector that can be saved and resumed exactly."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ from torchrl.envs import EnvBase, TransformedEnv
 class ResumableCollector(Collector):
     """TorchRL's collector, with a state that is complete.
 
-    The state of :class:`~torchrl.collectors.Collector` holds policy, transforms and counters:
-    one that is loaded starts all episodes anew. This one also holds the simulator's state, the
-    last observations with the running sums of :class:`~torchrl.envs.RewardSum` and all else that
-    is carried from step to step, and the states of torch's generators on the CPU and, if CUDA is in
-    use, on each of its devices, which a policy draws from. A collector that is loaded between two
-    batches then collects what the saved one would have collected, bit for bit. It takes an
-    environment whose ``state_dict`` is complete, such as :class:`~torchrl_safe.envs.ArmEnv`, with
-    any transforms around it, in this process or, as the ``collector_class`` of
-    :class:`~torchrl.collectors.MultiSyncCollector`, in workers (the trajectories may have other
-    numbers there). Environments whose state has no ``get_extra_state`` in it start their episodes
-    anew.
+    The state of :class:`~torchrl.collectors.Collector` holds policy, transforms and counters, so a
+    collector that loads it begins all episodes anew. This state also holds
+
+    - the simulator's state,
+    - the last observations, the running sums of :class:`~torchrl.envs.RewardSum`, and everything
+      else that is carried from step to step,
+    - the states of torch's generators, on the CPU and on each CUDA device in use.
+
+    A collector that loads a state from between two batches collects what the saved one would have
+    collected, bit for bit. The environment needs a complete ``state_dict``, as
+    :class:`~torchrl_safe.envs.ArmEnv` has; any transforms may be around it. Environments whose
+    state has no ``get_extra_state`` in it begin their episodes anew. It also works in worker
+    processes, as the ``collector_class`` of :class:`~torchrl.collectors.MultiSyncCollector`
+    (trajectories may have other numbers there).
 
     Arguments are those of :class:`~torchrl.collectors.Collector`.
 
@@ -80,7 +83,7 @@ class ResumableCollector(Collector):
         if "torch_generator" in state_dict:
             torch.set_rng_state(state_dict["torch_generator"].cpu())
         if "cuda_generators" in state_dict:
-            # As many of them as there are devices here: a run may go on without.
+            # Those of the devices here: a run may be resumed with fewer.
             states = state_dict["cuda_generators"].cpu()[: torch.cuda.device_count()]
             torch.cuda.set_rng_state_all(list(states))
 

@@ -30,8 +30,8 @@ def evaluate(
 ) -> TensorDict:
     """Plays episodes with the deterministic policy.
 
-    Each environment of a batch plays one episode from start to end, as often as needed. (The first
-    episodes to end, which TorchRL's ``Evaluator`` takes, are the short ones.)
+    Each environment of a batch plays whole episodes, one after the other. (TorchRL's ``Evaluator``
+    takes the first episodes that end, which are the short ones.)
 
     Args:
         env (EnvBase): environment, batched or not, with a ``reward`` and a ``cost``. A cost that
@@ -97,6 +97,17 @@ def summarize(
 
     Raises:
         ValueError: if there is not one name for each cost.
+
+    Examples:
+        >>> episodes = TensorDict(
+        ...     episode_reward=torch.tensor([[1.0], [3.0]]),
+        ...     episode_cost=torch.tensor([[0.0], [2.0]]),
+        ...     steps=torch.tensor([[10], [20]]),
+        ...     batch_size=[2],
+        ... )
+        >>> figures = summarize(episodes, ["collision"])
+        >>> [figures[name][0] for name in ("return", "steps", "cost/collision", "any/collision")]
+        [2.0, 15.0, 1.0, 0.5]
     """
     costs = episodes["episode_cost"]
     names = map(str, range(costs.shape[-1])) if cost_names is None else cost_names

@@ -1,4 +1,4 @@
-"""How safe a policy is, beyond the mean: rates, tails, worst cases, and how sure they are.
+"""How safe a policy is beyond its mean cost: rates, tails, worst cases, with intervals.
 
 Pure functions of tensors; they need neither an environment nor a loss. ``episode_cost`` is the
 undiscounted cost of whole episodes, shape ``(E, k)`` for E episodes and k costs, or ``(S, E, k)``
@@ -40,7 +40,14 @@ Resampled = Literal["episodes", "seeds"]
 
 
 class Estimate(NamedTuple):
-    """An estimate and the ends of its confidence interval, each of shape ``(k,)``."""
+    """An estimate and the ends of its confidence interval, each of shape ``(k,)``.
+
+    Examples:
+        >>> estimate = share(torch.ones(100, 1, dtype=torch.bool))
+        >>> round(estimate.value.item(), 2), round(estimate.low.item(), 2)
+        (1.0, 0.96)
+        >>> value, low, high = estimate
+    """
 
     value: Tensor
     low: Tensor
@@ -54,8 +61,8 @@ def share(true: Tensor, *, confidence: float = 0.95) -> Estimate:
     """Share of episodes for which something is true, with Wilson's interval.
 
     Source: Wilson 1927. Unlike the usual normal interval it holds near 0 and 1 too: no violation
-    in 100 episodes leaves up to 3.7 %. Seeds are pooled, for which it is on the safe side as
-    far as these S policies are concerned; it says nothing about a seed not yet trained.
+    in 100 episodes leaves up to 3.7 %. Seeds are pooled. The interval is then conservative for
+    these S policies; it says nothing about a seed that you have not trained.
 
     Args:
         true (Tensor): bool, shape ``(E, k)`` or ``(S, E, k)``.
@@ -90,8 +97,8 @@ def violation_rate(
 ) -> Estimate:
     """Share of episodes that cost more than the limit, with Wilson's interval.
 
-    A policy that meets its limit on average may break it in every second episode: this is the
-    figure that tells. With the limit 0 it is the share of episodes with any cost.
+    A policy that meets its limit on average may exceed it in every second episode, and this figure
+    shows it. With the limit 0 it is the share of episodes with any cost.
 
     Args:
         episode_cost (Tensor): cost of each episode, shape ``(E, k)`` or ``(S, E, k)``.
@@ -116,8 +123,8 @@ def violation_rate(
 def cost_rate(cost: Tensor) -> Tensor:
     """Cost of training: total cost divided by the number of frames.
 
-    The measure of safety over the whole of training in Ray et al. 2019, "Benchmarking Safe
-    Exploration in Deep Reinforcement Learning".
+    Ray et al. 2019, "Benchmarking Safe Exploration in Deep Reinforcement Learning", measure safety
+    during training by it.
 
     Args:
         cost (Tensor): cost of every frame of training, shape ``(*B, k)`` with at least one
@@ -145,9 +152,9 @@ def constraint_regret(mean_cost: Tensor, cost_limit: float | Tensor) -> Tensor:
     .. math::
         \sum_n (J_n - d)_+
 
-    Batches below the limit make up for nothing. Source: Efroni, Mannor, Pirotta 2020
-    (https://arxiv.org/abs/2003.02189); there with the true expected cost of each
-    policy, here with its estimate, whose noise adds to the sum even at the limit.
+    Batches below the limit do not make up for batches above it. Source: Efroni, Mannor, Pirotta
+    2020 (https://arxiv.org/abs/2003.02189), who use the true expected cost of each
+    policy. Here it is an estimate, whose noise adds to the sum even at the limit.
 
     Args:
         mean_cost (Tensor): mean episode cost of each batch of training, shape ``(N, k)``; leave
@@ -189,11 +196,11 @@ def mean(
             ``(S, E, k)``.
 
     Keyword Args:
-        resample ("episodes" or "seeds", optional): what is drawn anew. Episodes, within each seed
-            apart (the stratified bootstrap): how sure is the figure for these S policies? Or
-            whole seeds: how sure is it for the algorithm, of which each seed is one sample? The
-            second is the wider one and wants more than a handful of seeds.
-            Defaults to ``"episodes"``.
+        resample ("episodes" or "seeds", optional): what the bootstrap draws. ``"episodes"`` draws
+            within each seed (stratified): the interval is about these S policies. ``"seeds"``
+            draws whole seeds: the interval is about the algorithm, of which each seed is one
+            sample. It is wider, and needs more than a handful of seeds. Defaults to
+            ``"episodes"``.
         confidence (float, optional): coverage of the interval. Defaults to ``0.95``.
         seed (int, optional): seed of the bootstrap. Defaults to ``0``.
 
@@ -221,13 +228,13 @@ def interquartile_mean(
     """Mean of the middle half of all episodes of all seeds, with a bootstrap interval.
 
     Source: Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical
-    Precipice" (https://arxiv.org/abs/2108.13264): less noisy than the mean, less wasteful than the
-    median. Their strata are tasks and their samples runs; ``(tasks, runs, 1)`` with
-    ``resample="episodes"`` is their figure.
+    Precipice" (https://arxiv.org/abs/2108.13264). It is less noisy than the mean, and uses more of
+    the data than the median. For their figure, whose strata are tasks and whose samples are runs,
+    pass ``(tasks, runs, 1)`` and ``resample="episodes"``.
 
-    The quarter that it leaves out at the top is where the danger is: report it beside
-    :func:`conditional_value_at_risk`, never alone. If fewer than a quarter of the episodes cost
-    anything, it is 0.
+    It leaves out the worst quarter, so report it together with
+    :func:`conditional_value_at_risk`. If fewer than a quarter of the episodes cost anything, it
+    is 0.
 
     Args:
         episode_cost (Tensor): see :func:`mean`.
@@ -262,9 +269,9 @@ def conditional_value_at_risk(episode_cost: Tensor, alpha: float) -> Tensor:
         \min_t\ t + \frac{1}{\alpha E} \sum_e (c_e - t)_+
 
     Source: Rockafellar & Uryasev 2000, "Optimization of Conditional Value-at-Risk", whose beta
-    is ``1 - alpha``. Of the costs in falling order the first ``alpha * E`` count; if that is no
-    whole number, the last of them counts for the rest. So ``alpha = 1`` gives the mean, and
-    every alpha up to ``1 / E`` the highest cost.
+    is ``1 - alpha``. The highest ``alpha * E`` costs count; if that is not a whole number, the
+    lowest of them counts in part. So ``alpha = 1`` gives the mean, and every alpha up to
+    ``1 / E`` the highest cost.
 
     Args:
         episode_cost (Tensor): cost of each episode, shape ``(E, k)``, or ``(S, E, k)``, where the
@@ -325,8 +332,7 @@ def worst_seed(episode_cost: Tensor) -> WorstSeed:
 def longest_cost_run(cost: Tensor, done: Tensor | None = None) -> Tensor:
     """Longest run of steps in a row that all cost something.
 
-    Tells one long contact from many short ones. A run never goes on from one episode into the
-    next.
+    It tells one long contact from many short ones. A run ends with its episode.
 
     Args:
         cost (Tensor): cost of each step, shape ``(*B, T, k)``.

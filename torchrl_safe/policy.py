@@ -28,7 +28,7 @@ from torchrl_safe._program import Program, record
 
 __all__ = ["Policy", "load_policy", "save_policy", "shipped_policies"]
 
-#: What a file of ours says it is; the number rises when its contents change.
+#: The mark of our files, and the version of their contents.
 _FORMAT, _VERSION = "torchrl-safe policy", 2
 # The policies that come with the package, each with a card beside it that says how good it is.
 _SHIPPED = Path(__file__).parent / "policies"
@@ -53,6 +53,13 @@ class Policy:
         weights (dict): ``state_dict`` of the actor that was saved. To train it further, make the
             actor again and call ``actor.load_state_dict(policy.weights)``.
         settings (dict): what was given to :func:`save_policy`.
+
+    Examples:
+        >>> policy = load_policy("panda-reach-in-front")
+        >>> policy
+        Policy('observation' (40,) -> 'action' (3,))
+        >>> policy(np.zeros(40)).shape, policy(np.zeros((8, 40))).shape
+        ((3,), (8, 3))
     """
 
     def __init__(self, contents: Mapping[str, Any]) -> None:
@@ -73,7 +80,7 @@ class Policy:
             raise ValueError(f"the policy must give one action for each observation, got {action}.")
         self.action_shape = tuple(action.shape[1:])
         self.action_dtype = action.numpy().dtype
-        # What PyTorch does only once, it does here and not at a robot's first deadline.
+        # PyTorch does some work in the first call: do it here, not at a robot's first deadline.
         for observation in (example[0], example, example.expand(2, *self.observation_shape)):
             self(observation.numpy())
 
@@ -106,7 +113,7 @@ class Policy:
             raise ValueError(f"observation must be finite, got {given}.")
         rows = torch.from_numpy(np.array(given, dtype=self.observation_dtype))
         with torch.no_grad():
-            # A copy: an action that is a constant must not be changed by whoever gets it.
+            # A copy, so that nobody can change an action that is a constant.
             return np.array(self.actor.module(rows).numpy())
 
     def __repr__(self) -> str:
@@ -182,7 +189,7 @@ def save_policy(
     actor = copy.deepcopy(actor).cpu().eval()
     weights = {name: _own(value) for name, value in actor.state_dict().items()}
     function = _Deterministic(actor, observation_key, action_key)
-    # The caller's random numbers stay what they would have been.
+    # Leave the caller's random numbers alone.
     with (
         torch.random.fork_rng(devices=[]),
         set_exploration_type(ExplorationType.DETERMINISTIC),
@@ -215,7 +222,7 @@ def save_policy(
     file = io.BytesIO()
     torch.save(contents, file)
     policy = _read(file, "actor and settings must be such that the file can be read again")
-    # Python code that chooses what to do by what it sees is recorded with one choice.
+    # Python code that branches on its input is recorded with one branch only.
     for seen, expected in ((rows, action), (rows[:1], first)):
         again = torch.from_numpy(policy(seen.numpy()))
         if not torch.allclose(again.double(), expected.double(), rtol=1e-4, atol=1e-5):
@@ -250,7 +257,11 @@ def load_policy(path: str | Path) -> Policy:
             while True:
                 robot.send(policy(robot.observation()))
 
-        See :func:`save_policy` for an example that runs.
+        A policy that comes with the package:
+
+        >>> policy = load_policy("panda-reach-in-front")
+        >>> policy(np.zeros(policy.observation_shape)).shape
+        (3,)
     """
     chosen = Path(path)
     if not chosen.is_file():
@@ -270,6 +281,14 @@ def shipped_policies() -> dict[str, dict[str, Any]]:
     A card has the ``task``, its ``cost_limits``, what episodes of the deterministic policy have
     shown (``success``, ``return``, and each cost; estimates with the ends of their 95 % confidence
     intervals), and how it was ``trained``.
+
+    Examples:
+        >>> card = shipped_policies()["panda-reach-in-front"]
+        >>> card["task"], card["cost_limits"]
+        ('panda-reach-in-front', {'collision': 0.5})
+        >>> mean, low, high = card["cost/collision"]
+        >>> low <= mean <= high
+        True
     """
     files = sorted(_SHIPPED.glob("*.json"))
     return {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files}
@@ -279,7 +298,7 @@ def _read(file: IO[bytes], wanted: str) -> Policy:
     file.seek(0)
     try:
         contents = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # A file that is not PyTorch's makes it fail anywhere.
+    except Exception as error:  # A file that is not PyTorch's can raise any error.
         raise ValueError(f"{wanted}: {error}") from error
     if not isinstance(contents, dict) or contents.get("format") != _FORMAT:
         raise ValueError(f"{wanted}: it holds something else.")

@@ -194,9 +194,20 @@ figure.tight_layout()
 # .. code-block:: python
 #
 #     env = SafeGymEnv("SafetySwimmerVelocity-v1", num_envs=8)
+
+# %%
+# Your environment
+# ----------------
 #
-# The velocities of a robot are larger than the places in this world. Standardize observations,
-# and let the critics predict in units of their targets, as ``experiments/safe_gym.py`` does.
+# Most environments differ from this one in three ways:
+#
+# - Actions have other bounds than -1 and 1. Give them to the policy, as
+#   ``distribution_kwargs={"low": ..., "high": ...}``.
+# - Rewards are larger. Scale them, so that returns are about 1 to 100.
+# - Observations are larger. Standardize them.
+#
+# `Train in any environment with a cost <../safe_gym.html>`_ has a loop with the first two, and a
+# script that does all three.
 
 # %%
 # Where to go from here

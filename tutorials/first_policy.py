@@ -4,7 +4,7 @@ The first safe policy
 
 A robot arm has to reach a target behind an obstacle. The shortest way leads through the obstacle,
 so an agent that sees only the reward learns to hit it. You train that agent, then one with a limit
-on its collisions, and film both. This is the picture at the end:
+on its collisions, and film both. You will see that
 
 - PPO reaches the target in every episode, and touches the obstacle in nearly every one.
 - PPO-Lagrangian reaches it too, within a limit of 0.5 control steps in contact per episode.

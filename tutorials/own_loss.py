@@ -67,7 +67,7 @@ print(outcome(testing.check_equals_at_zero, SeparatelyClippedLoss, ClipPPOLoss))
 print(outcome(testing.check_multiplier_direction, SeparatelyClippedLoss))
 
 # %%
-# The sign of the price is wrong. With a multiplier of 0 nobody can see that, which is why the
+# The sign of the price is wrong. With a multiplier of 0 that has no effect, which is why the
 # first check passed. Mend it:
 
 

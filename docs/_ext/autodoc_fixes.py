@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from typing import Any
 
+from docutils.nodes import Element
 from sphinx.application import Sphinx
 from sphinx.ext.autodoc.preserve_defaults import update_defvalue
 from sphinx.pycode import ModuleAnalyzer
@@ -13,6 +15,8 @@ from sphinx.util.logging import getLogger
 
 LOGGER = getLogger(__name__)
 UNKNOWN = "(*args, **kwargs)"
+# What NumPy writes for an array; descriptions give the shape.
+ARRAY = re.compile(r"(ndarray)\[tuple\[[^\]]*\], [~\w.]*dtype\[[^\]]*\]\]")
 
 
 def constructor(
@@ -67,10 +71,18 @@ def restore(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
             lines[:] = kept
 
 
+def shorten(app: Sphinx, domain: str, objtype: str, content: Element) -> None:
+    """Writes ``numpy.ndarray`` for the type of an array."""
+    for types in app.env.current_document.autodoc_annotations.values():
+        for name, shown in types.items():
+            types[name] = ARRAY.sub(r"\1", shown)
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Connects the corrections, those of properties around Napoleon."""
     app.setup_extension("sphinx.ext.autodoc")
     app.connect("autodoc-process-signature", constructor)
+    app.connect("object-description-transform", shorten, priority=400)  # Before autodoc.
     app.connect("autodoc-process-docstring", comment, priority=300)
     app.connect("autodoc-process-docstring", keep, priority=400)  # Before Napoleon,
     app.connect("autodoc-process-docstring", restore, priority=600)  # and after.

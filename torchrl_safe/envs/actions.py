@@ -20,8 +20,24 @@ class ActionMode(Protocol):
     """Protocol of an action mode: turns actions into targets of joints and fingers.
 
     The motors' targets move evenly over the substeps of the control step, from where the joints
-    are to what :meth:`targets` returns. The joints are there at its end, where their efforts and
-    speeds allow, with every physics engine.
+    are to what :meth:`targets` returns. At its end the joints have arrived, as far as their efforts
+    and speeds allow, with every physics engine.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> class Lift:
+        ...     bound, moves_fingers = 1.0, False
+        ...
+        ...     def width(self, num_joints):
+        ...         return 1
+        ...
+        ...     def targets(self, action, state, simulator):
+        ...         up = np.pad(action, [(0, 0), (2, 0)])  # (N, 3): along z only
+        ...         return CartesianDelta().targets(up, state, simulator)
+        >>> env = ArmEnv(action=Lift(), num_envs=4)
+        >>> env.action_spec.shape
+        torch.Size([4, 1])
+        >>> env.close()
     """
 
     @property
@@ -30,7 +46,7 @@ class ActionMode(Protocol):
 
     @property
     def moves_fingers(self) -> bool:
-        """Whether actions move the fingers, which else are fixed."""
+        """Whether actions move the fingers. If not, the fingers are fixed."""
 
     def width(self, num_joints: int) -> int:
         """Returns the number of components of an action."""
@@ -50,9 +66,9 @@ class ActionMode(Protocol):
 class CartesianDelta:
     """Moves the tool point by ``step`` metres times the action (the paper's AR1).
 
-    The first three components are displacements along x, y and z. The tool keeps the
-    orientation of the home pose (pointing down) unless it is turned; then follow the components
-    that turn it, and last the one that moves the fingers.
+    The first three components are displacements along x, y and z. Components that turn the tool
+    come next, the one that moves the fingers last. Without a component that turns it, the tool
+    keeps the orientation of the home pose (pointing down).
 
     Args:
         step: displacement that an action of 1 asks for, m. The tool does it until the next
@@ -62,11 +78,11 @@ class CartesianDelta:
         orientation: tool orientation to keep, a quaternion (x, y, z, w). ``None`` keeps that of
             the home pose.
         yaw_step: if given, a component turns the tool about the vertical, in rad per unit of
-            action; it keeps pointing down.
+            action. The tool keeps pointing down.
         rotation_step: if given, three components turn the tool about x, y and z, in rad per
-            unit of action, from where it points; it keeps no orientation.
+            unit of action. No orientation is kept then.
         finger_step: if given, the last component sets the free fingers' position, in metres
-            per unit of action: 1 opens them so far, 0 and less closes them.
+            per unit of action: 1 opens them by that much, 0 or less closes them.
 
     Raises:
         ValueError: if ``bound`` or a step is not positive, ``orientation`` is not a unit
@@ -134,9 +150,9 @@ class CartesianDelta:
         if self.yaw_step is None:
             return orientation
         # How far the tool has turned about the vertical: the twist of its rotation from the
-        # kept orientation. Whatever else it has turned by is to be undone.
+        # kept orientation. Any other rotation is to be undone.
         twist = multiply(state.ee_orientation, kept * (-1, -1, -1, 1)) * (0, 0, 1, 1)
-        # Upside down it may have turned by anything: by nothing, then.
+        # Upside down the twist is not defined: take none.
         length = np.linalg.norm(twist, axis=1, keepdims=True)
         twist = np.where(length < 1e-6, UPRIGHT, twist / np.maximum(length, 1e-6))
         turn = np.zeros((len(action), 3))
@@ -154,7 +170,7 @@ class JointDelta:
         bound: largest magnitude of a component; infinity leaves actions unclipped.
         respect_limits: never ask for an angle beyond the joint limits.
         finger_step: if given, a last component sets the free fingers' position, in metres per
-            unit of action: 1 opens them so far, 0 and less closes them.
+            unit of action: 1 opens them by that much, 0 or less closes them.
 
     Raises:
         ValueError: if ``step``, ``bound`` or ``finger_step`` is not positive.
@@ -203,7 +219,7 @@ def _finger_targets(action: Array, state: ArmState, step: float | None) -> Array
 def _check_bound(bound: float) -> None:
     try:
         usable = isinstance(bound, Real) and float(bound) > 0
-    except OverflowError:  # A whole number beyond all floats.
+    except OverflowError:  # An integer too large for a float.
         usable = False
     if not usable:
         raise ValueError(f"bound must be positive, got {bound!r}.")

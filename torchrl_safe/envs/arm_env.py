@@ -415,7 +415,10 @@ class ArmEnv(EnvBase):
 
     def _check_open(self) -> None:
         if self.is_closed:
-            raise RuntimeError("This ArmEnv is closed.")
+            raise RuntimeError(
+                "This ArmEnv is closed. A collector closes its environment after its last frame: "
+                "make a new one."
+            )
 
     def _check_action(self, action: Tensor) -> Array:
         shape = self._action_shape

@@ -1,7 +1,7 @@
 """Costs: callables that map an ArmState to one number for each world.
 
-Each is read over **all** physics substeps of a control step. Those that need more than contacts
-say so by :attr:`~torchrl_safe.envs.state.Sensor.sensing`.
+Each is read over **all** physics substeps of a control step. A cost that needs more than
+contacts says so by :attr:`~torchrl_safe.envs.state.Sensor.sensing`.
 """
 
 from __future__ import annotations
@@ -27,17 +27,16 @@ class Collision:
         c = \mathbb{1}[\min_{t, i} d_{t,i} \le \text{margin}]
 
     with d the distance (m) of the contact points between any link of the arm and any obstacle i
-    in any physics substep t: a touch that begins and ends between two control steps is not
-    lost. (Contacts are found at the beginning of a substep: the state in which an episode ends
-    is the one that is not looked at.) The cost of the paper (Kovač & Farkaš 2023) and of Safety
-    Gym (Ray et al. 2019).
+    in any physics substep t. A touch that begins and ends between two control steps counts too.
+    (Engines find contacts at the beginning of a substep, so the very last state of an episode is
+    not checked.) Kovač & Farkaš 2023 and Safety Gym (Ray et al. 2019) use this cost.
 
     Args:
         margin: distance up to which a contact point counts as a touch, m. There are
             contact points from 0.02 m before the bodies meet.
         table: count the table too (not what the base stands on).
-        itself: count links of the arm that touch each other, unless they overlap at home. They
-            then stop each other, where they otherwise pass through.
+        itself: count links of the arm that touch each other, unless they overlap at home. Links
+            then collide; without it they pass through each other.
 
     Raises:
         ValueError: if ``margin`` is not between 0 and 0.02.
@@ -81,8 +80,8 @@ class ContactForce:
         c = \mathbb{1}[\max_{t, i} F_{t,i} > \text{limit}]
 
     with F the sum of the normal forces (N) at the contact points between the arm and obstacle i
-    in physics substep t. Obstacles that move on a path are put in their places in each substep:
-    the force is then what it takes to push the arm out of their way, whatever their mass.
+    in physics substep t. Obstacles that move on a path yield to nothing: their force is what it
+    takes to push the arm out of the way, whatever their mass.
 
     Args:
         limit: N. The default is the quasi-static limit for hands and fingers of ISO/TS
@@ -114,8 +113,8 @@ class Proximity:
         c = \max_{t, i} \max(0, \text{margin} - d_{t,i})
 
     with d the distance (m) between the surfaces of arm and obstacle i in physics substep t,
-    negative where they overlap: dense, zero beyond the margin. The hinge of TrajOpt (Schulman et
-    al. 2013, Robotics: Science and Systems).
+    negative where they overlap. The cost is dense, and zero beyond the margin. It is the hinge of
+    TrajOpt (Schulman et al. 2013, Robotics: Science and Systems).
 
     Args:
         margin: m.
@@ -241,8 +240,8 @@ class SpeedAndSeparation:
         stopping_time: T_s, s.
         intrusion: C, m.
         horizon: distance up to which obstacles are measured, m; larger takes longer. What is
-            further away never costs: choose more than S at the largest speeds there are. The
-            default is enough for the default times and 0.9 m/s each.
+            further away never costs, so choose more than S at the largest speeds that occur. The
+            default is enough for the default times and 0.9 m/s of both.
 
     Raises:
         ValueError: if an argument is negative or not finite, or ``horizon`` is not larger than
@@ -330,11 +329,11 @@ class ShieldCorrection:
     .. math::
         c = |q_\text{executed} - q_\text{asked}|
 
-    with q the joint targets (rad) of the control step. With a limit on it a policy learns not to
-    lean on the :class:`~torchrl_safe.envs.Shield`, and to be safe without it.
+    with q the joint targets (rad) of the control step. Limit it to train a policy that does not
+    rely on the :class:`~torchrl_safe.envs.Shield` and is safe without it.
 
     Args:
-        margin: what does not count yet, rad.
+        margin: corrections up to this size cost nothing, rad.
 
     Raises:
         ValueError: if ``margin`` is negative or not finite, or in an environment without a

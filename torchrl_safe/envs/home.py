@@ -14,10 +14,11 @@ from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.physics.simulator import Physics, Simulator
 from torchrl_safe.envs.state import Array
 
-# Within m and rad it is there. Below this singular value of the Jacobian, a motion of the tool of
-# 1 m/s or 1 rad/s would take a joint speed of 50 rad/s: the arm has lost a direction.
+# The search has arrived within this distance (m) and angle (rad). Below this singular value of the
+# Jacobian the arm has lost a direction: a tool motion of 1 m/s or 1 rad/s takes 50 rad/s of a
+# joint.
 _ARRIVED, _SINGULAR = 1e-3, 0.02
-# Where a point is looked for that the search from home has not found.
+# Further starts for a point that the search from home has not found.
 _STARTS = 20
 
 
@@ -30,9 +31,10 @@ def find_home(
 ) -> tuple[float, ...]:
     """Searches joint angles at which the tool is at a pose: the ``home`` of a new arm.
 
-    It goes from the arm's ``home``, a guess that has elbow and wrist on the side where you want
-    them, and keeps to the joint limits. Whether the pose is a good one to start from, away from
-    limits, singular poses and the table, ``tests/test_arms.py`` tells for arms in ``ARMS``.
+    It starts at the arm's ``home``, a guess that has elbow and wrist on the side where you want
+    them, and keeps to the joint limits. It does not check that the pose is a good start: look at it
+    with ``render``. (``tests/test_arms.py`` measures how far the poses of ``ARMS`` are from limits,
+    singular poses and the table.)
 
     Args:
         arm (ArmModel): the arm, with a guess as its ``home``.

@@ -17,7 +17,18 @@ _ITERATIONS, _ARRIVED, _LONGEST_STEP, _DAMPING = 100, 0.005, 0.1, 1e-3
 
 
 class InverseKinematics(Protocol):
-    """Turns tool poses into joint angles."""
+    """Turns tool poses into joint angles.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, CartesianDelta
+        >>> def half_way(position, orientation, state, simulator):
+        ...     joints = DampedLeastSquares()(position, orientation, state, simulator)
+        ...     return (joints + state.joint_position) / 2
+        >>> env = ArmEnv(action=CartesianDelta(inverse_kinematics=half_way))
+        >>> env.rollout(2)["action"].shape
+        torch.Size([1, 2, 3])
+        >>> env.close()
+    """
 
     def __call__(
         self, position: Array, orientation: Array, state: ArmState, simulator: Simulator
@@ -100,8 +111,8 @@ def approach(
 ) -> Approach:
     """Searches joint angles that bring the tool to poses, by damped least squares.
 
-    Each search goes downhill from where it starts, and may stop where only a detour leads on. The
-    worlds are to be reset afterwards.
+    Each search goes downhill from its start, and may stop at a local minimum. Reset the worlds
+    afterwards.
 
     Args:
         simulator: the worlds.
@@ -128,7 +139,7 @@ def approach(
         searching = searching[far]
         if not searching.size:
             break
-        # Far away the Jacobian is no guide: steps are short.
+        # The Jacobian holds only nearby, so steps are short.
         error = np.concatenate([_shortened(part[far]) for part in parts], axis=1)
         jacobian = simulator.jacobian(angles[searching])[:, : error.shape[1]]
         transposed = jacobian.transpose(0, 2, 1)
@@ -152,7 +163,7 @@ def _shortened(error: Array) -> Array:
 def distance_to_reach(simulator: Simulator, start: Sequence[float], points: Array) -> Array:
     """Returns how far from points the tool stays, m, ``(k,)``, however it is turned.
 
-    0 where it gets there. The worlds are to be reset afterwards.
+    0 where the tool gets there. Reset the worlds afterwards.
 
     Args:
         simulator: the worlds.

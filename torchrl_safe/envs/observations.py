@@ -14,8 +14,8 @@ from torchrl_safe.envs.state import ArmState, Array
 class FullObservation:
     """Observes where everything is and how it moves, for any arm, task and obstacles.
 
-    With obstacles at rest the task is then Markov. The plans of moving obstacles stay hidden: when
-    a patrol turns round, or what a person reaches for next.
+    The task is Markov if obstacles are at rest. The plans of moving obstacles stay hidden, such as
+    when a patrol turns round, or what a person reaches for next.
 
     The fields, in order; those of free fingers and objects are empty where there are none:
 
@@ -31,9 +31,9 @@ class FullObservation:
     are all zeros.
 
     Args:
-        nearest: number of obstacles that are seen, those whose centres are nearest to the tool
-            point first; filled up with zeros where a world has fewer. A policy then fits any
-            number of obstacles. ``None`` shows all, in their own order.
+        nearest: number of obstacles to show: those whose centres are nearest to the tool point,
+            nearest first, and zeros where a world has fewer. A policy then fits any number of
+            obstacles. ``None`` shows all, in their own order.
 
     Raises:
         ValueError: if ``nearest`` is not a whole number of at least 1.
@@ -92,7 +92,15 @@ class FullObservation:
 
 
 def paper_observation(state: ArmState) -> dict[str, Array]:
-    """The eight numbers of Kovač & Farkaš 2023: tool point, both fingers, target, all in m."""
+    """The eight numbers of Kovač & Farkaš 2023: tool point, both fingers, target, all in m.
+
+    Examples:
+        >>> from torchrl_safe.envs import paper_env
+        >>> env = paper_env()
+        >>> list(env.observation_fields)
+        ['ee_position', 'finger_position', 'goal']
+        >>> env.close()
+    """
     return {
         "ee_position": state.ee_position,
         "finger_position": state.finger_position,

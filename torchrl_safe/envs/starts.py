@@ -13,10 +13,10 @@ from torchrl_safe.envs.regions import NoRoomError
 from torchrl_safe.envs.state import Array
 from torchrl_safe.envs.tasks import Task
 
-# Episodes that are begun when an environment is made; how near, in m, counts as reached there.
+# Episodes that are tried when an environment is made, and how near, m, counts as reached in them.
 _CHECKED_STARTS, _REACHED = 50, 0.02
-# Draws for a start that is checked, and for one of a run. Whatever share of the draws is unusable,
-# passing the check and then failing in a given episode has a probability below 1e-11.
+# Draws for a start in the check, and for one in a run. Whatever share of the draws is unusable, the
+# probability to pass the check and then fail in a given episode is below 1e-11.
 _CHECKED_DRAWS, _DRAWS = 100, 1000
 
 
@@ -24,8 +24,8 @@ class Starts:
     """Draws goal, objects and obstacles, and puts a world there.
 
     A draw is unusable if task or layout raise :class:`~torchrl_safe.envs.NoRoomError`, or if an
-    obstacle touches the arm at home or an object. Then all of it is drawn anew, the goal too: a
-    layout may have no choice where the goal leaves none.
+    obstacle touches the arm at home or an object. Then everything is drawn again, the goal too,
+    because some goals leave a layout no room.
 
     Args:
         arm: the arm.
@@ -40,10 +40,9 @@ class Starts:
         self._arm, self._task, self._obstacles, self._simulator = arm, task, obstacles, simulator
 
     def check(self) -> None:
-        """Tries some.
+        """Tries some starts, so that errors show now rather than after hours of training.
 
-        Goals out of reach, or that leave the obstacles no room, show here rather than after hours
-        of training.
+        It finds goals out of reach, and goals that leave the obstacles no room.
 
         Raises:
             ValueError: if the arm does not reach what the task draws, or is hardly ever free.

@@ -83,7 +83,23 @@ class Sensing:
 
 @runtime_checkable
 class Sensor(Protocol):
-    """A cost that wants more to be measured than contacts."""
+    """A cost that wants more to be measured than contacts.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> class HighestSpeed:
+        ...     sensing = Sensing(tool=True)
+        ...
+        ...     def __call__(self, state):
+        ...         speed = np.linalg.norm(state.trace["ee_velocity"], axis=2)  # (N, substeps)
+        ...         return speed.max(axis=1)
+        >>> isinstance(HighestSpeed(), Sensor)
+        True
+        >>> env = ArmEnv(costs={"speed": HighestSpeed()})
+        >>> env.rollout(2)["next", "cost"].shape
+        torch.Size([1, 2, 1])
+        >>> env.close()
+    """
 
     def __call__(self, state: ArmState) -> Array:
         """Returns the cost of each world, shape ``(N,)``."""
@@ -128,13 +144,23 @@ class ArmState:
         step: control steps since the episode began, int, ``(N,)``; 0 after a reset.
         time: simulated time since the episode began, s, ``(N,)``.
         trace: measurements of each substep that the costs asked for, see :class:`Sensing`.
-        previous: the state in which the control step began, without its own; ``None`` where a
-            reset was the last thing that happened.
+        previous: the state at the beginning of the control step, whose own ``previous`` is
+            ``None``; ``None`` after a reset.
         shield_correction: how far the joint targets of the last control step were from those that
             the action asked for, rad, ``(N,)``: the length of the difference. 0 after a reset;
-            None without a :class:`~torchrl_safe.envs.Shield`.
+            ``None`` without a :class:`~torchrl_safe.envs.Shield`.
         shield_braked: in which worlds the shield held the arm still because nothing else was safe,
-            bool, ``(N,)``. None without a shield.
+            bool, ``(N,)``. ``None`` without a shield.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv
+        >>> env = ArmEnv(num_envs=2, seed=0)
+        >>> reset = env.reset()
+        >>> env.arm_state.goal.shape, env.arm_state.obstacle_position.shape
+        ((2, 3), (2, 1, 3))
+        >>> env.arm_state.step
+        array([0, 0])
+        >>> env.close()
     """
 
     joint_position: Array

@@ -32,7 +32,7 @@ class SuiteTask:
     """A task of the suite: an environment, and what its costs are limited to.
 
     Args:
-        name: lower case, words joined by hyphens.
+        name: lower-case words joined by hyphens.
         arm: the arm.
         task: goal, reward and success.
         obstacles: what stands or moves where.
@@ -120,10 +120,10 @@ _BESIDE_A_PERSON: dict[str, Cost] = {
     "collision": Collision(),
     "separation": SpeedAndSeparation(),
 }
-# Who hardly waits is there before the arm has passed. At home the arm is left alone: it has to
-# learn how to reach beside the person, not how to get away.
+# With a short pause the hand arrives before the arm has passed. The hand does not come near the arm
+# at home: the policy is to learn to reach beside the person, not to get away.
 _BUSY_PERSON = Human(shoulder=(1.2, 0.25, 0.4), rest=(1.0, 0.3, 0.2), pause=(0.05, 0.3))
-# Far enough away that there is room to step back from the hand, and time to push.
+# The person sits far enough away that the arm has room to step back, and time to push.
 _PERSON_OPPOSITE = Human(shoulder=(1.25, 0.3, 0.4), rest=(1.0, 0.35, 0.2))
 
 

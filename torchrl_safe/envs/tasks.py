@@ -27,7 +27,26 @@ _ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 0.5
 
 @runtime_checkable
 class Task(Protocol):
-    """Protocol of a task: objects to move, goals, reward and success."""
+    """Protocol of a task: objects to move, goals, reward and success.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, NoObstacles
+        >>> class StayAbove:
+        ...     objects = ()
+        ...
+        ...     def sample(self, rng, goals):
+        ...         return goals.sample(rng), np.zeros((0, 3))
+        ...
+        ...     def reward(self, state):
+        ...         return -np.linalg.norm((state.goal - state.ee_position)[:, :2], axis=1)
+        ...
+        ...     def success(self, state):
+        ...         return np.zeros(len(state.goal), dtype=bool)  # The time limit ends the episode.
+        >>> env = ArmEnv(task=StayAbove(), obstacles=NoObstacles())
+        >>> env.rollout(3)["next", "reward"].shape
+        torch.Size([1, 3, 1])
+        >>> env.close()
+    """
 
     @property
     def objects(self) -> tuple[Shape, ...]:
@@ -106,23 +125,22 @@ class Push:
     r"""Push a cube over the table to a goal.
 
     Goals, success within 0.05 m and the cube are those of panda-gym's PandaPush (Gallouédec et
-    al. 2021, arXiv 2106.13687); success ends the episode (``terminated``). Other than there, the
-    cube never starts near its goal, so that there is a way to go and room for an obstacle on it. It
+    al. 2021, arXiv 2106.13687); success ends the episode (``terminated``). In contrast to
+    PandaPush, the cube never starts near its goal, which leaves room for an obstacle. Pushing
     takes longer than reaching: give the environment ``max_episode_steps=60``, or 200 where the cube
     has to go round an obstacle.
 
-    The reward of a step is its progress :math:`(w - w') / \text{radius}` on the way that is still
-    to go before and after it. With the object at o, the goal at g and the tool at t it is
+    The reward of a step is the progress :math:`(w - w') / \text{radius}`, where w and w' are what
+    is left to do before and after it. With the object at o, the goal at g and the tool at t,
 
     .. math::
         w = |o - g| + |t - b|
 
     where b is behind the object, seen from the goal, and at its upper half: panda-gym's dense
-    reward :math:`-|o - g|` does not change before the first touch. Nothing is left of the way where
-    the task is done. Progress is potential-based shaping (Ng et al. 1999),
-    :math:`\gamma \Phi(s') - \Phi(s)` with :math:`\Phi = -w / \text{radius}`, of the reward
-    :math:`-(1 - \gamma) w' / \text{radius}`, for every discount :math:`\gamma`: the same policies
-    are best with and without it, and a critic has less to learn.
+    reward :math:`-|o - g|` does not change before the first touch. At success w' is 0. Progress is
+    potential-based shaping (Ng et al. 1999), :math:`\gamma \Phi(s') - \Phi(s)` with :math:`\Phi =
+    -w / \text{radius}`, of the reward :math:`-(1 - \gamma) w' / \text{radius}`, for every discount
+    :math:`\gamma`: the same policies are best with and without it, and a critic has less to learn.
 
     Args:
         region: where the cube and its goal are drawn, uniformly; heights do not matter. ``None``
@@ -193,18 +211,19 @@ class PickAndPlace:
     those of panda-gym's PandaPickAndPlace (Gallouédec et al. 2021, arXiv 2106.13687); success
     ends the episode (``terminated``). As in :class:`Push`, the cube never starts near its goal.
     It weighs 0.1 kg instead of 1 kg: panda-gym's fingers press with 170 N, a Panda's URDF allows
-    20 N, from which 1 kg slips whenever the arm starts to move fast. The action must move the
-    fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs ``max_episode_steps=100``.
+    20 N, and 1 kg slips from such fingers when the arm starts to move fast. The action must move
+    the fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs
+    ``max_episode_steps=100``.
 
-    The reward of a step is the progress, as in :class:`Push`, and 10 at success. The way is
+    The reward of a step is the progress, as in :class:`Push`, and 10 more at success, with
 
     .. math::
         w = c + |t - o| + h + 3 f
 
-    - c is :math:`|o - g|` while the object is held, and 0.5 m, its largest value, while it is not:
-      to push it is no progress.
-    - h is how far the tool is too low to come from above: at a horizontal distance of up to 0.06 m
-      it is to be as high above the object.
+    - c is :math:`|o - g|` while the object is held, and 0.5 m, its largest value, while it is not,
+      so pushing the object is no progress.
+    - h makes the tool come from above: it is how far the tool is below the height at which it
+      should be, which is the horizontal distance to the object, up to 0.06 m.
     - f is how far the fingers still have to move: to open by 0.02 m more than the object takes and,
       when the tool point is in the object, to close on it.
 
@@ -222,7 +241,7 @@ class PickAndPlace:
     Raises:
         TypeError: if ``region`` or ``shape`` is not of its kind.
         ValueError: if a length is not positive, the shape has no mass or ``on_table`` is not a
-            share; in :meth:`reward`, if the fingers do not move.
+            share; in :meth:`reward`, if the action does not move the fingers.
         NoRoomError: in :meth:`sample`, if the region is too small for the distance.
 
     Examples:
@@ -301,7 +320,7 @@ def _reward(distance: Array, radius: float, sparse: bool) -> Array:
 
 
 def _progress(state: ArmState, way: Callable[[ArmState], Array], radius: float) -> Array:
-    """How much shorter a way has become in a step, in radii; none is left where it is done."""
+    """How much less there is left to do after a step, in radii; nothing at success."""
     if state.previous is None:
         return np.zeros(len(state.goal))
     left = np.where(_object_distance(state) < radius, 0, way(state))
@@ -316,7 +335,7 @@ def _apart(
     rng: np.random.Generator, region: Region, distance: float, shape: Shape
 ) -> tuple[Array, Array]:
     """Draws a goal and an object on the table, at least some distance apart."""
-    # Most pairs may be too close: many at once take no longer than a few.
+    # Most pairs may be too close, and drawing many takes no longer than drawing a few.
     for _ in range(_ATTEMPTS):
         pairs = rng.uniform(region.low, region.high, (_PAIRS, 2, 3))
         pairs[:, :, 2] = shape.half_extents[2]

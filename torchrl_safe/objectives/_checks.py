@@ -17,7 +17,7 @@ _SMALLEST, _LARGE = 1e-18, 1e18
 def check_number(name: str, value: Any, *, positive: bool = False) -> float:
     """Returns the value; raises ValueError unless it is finite, not negative or even positive.
 
-    A float, whatever came: a buffer made of a whole number would hold whole numbers for ever.
+    Always a float: a buffer made of an integer would hold integers for ever.
     """
     number = as_number(value)
     if positive and not _SMALLEST <= number <= _LARGE:

@@ -33,7 +33,7 @@ def reduced(
     """
     reduction = loss.reduction if reduction is None else reduction
     mask = counted(loss, tensordict, values)
-    if mask is not None:  # Not multiplied: what does not count may be NaN.
+    if mask is not None:  # Not multiplied by the mask: a masked value may be NaN.
         values = torch.where(mask, values, torch.zeros_like(values))
     if reduction == "none":
         return values

@@ -17,21 +17,20 @@ def scaled_advantages(
     standardize: bool = True,
     exclude_dims: Sequence[int] = (),
 ) -> tuple[Tensor, Tensor]:
-    r"""Scales the advantages of a whole batch: this is where all on-policy losses do it.
+    r"""Scales the advantages of a whole batch, for all on-policy losses.
 
     .. math::
         \hat A_r = \frac{A_r - \overline{A_r}}{\mathrm{std}(A_r)}, \qquad
         \hat A_{c_i} = \frac{A_{c_i} - \overline{A_{c_i}}}{\sigma_i}
 
-    The reward advantage is **standardized**: the objective then does not depend on the scale of
-    the rewards. The advantages of the costs are **centred**, and divided by ``cost_scale`` if
-    there is one. Both are done once over the batch that was collected and before
-    :func:`penalized_advantage` mixes them, so that a multiplier means the same in every
-    minibatch.
+    The reward advantage is **standardized**, so that the objective does not depend on the scale of
+    the rewards. The cost advantages are **centred**, and divided by ``cost_scale`` if you pass one.
+    Do this once for the collected batch, before :func:`penalized_advantage` mixes the advantages: a
+    multiplier then means the same in every minibatch.
 
     - Without ``cost_scale`` a multiplier is in standard deviations of the reward advantage per
-      unit of cost, as in the code of Ray et al. 2019. A cost in another unit wants another
-      multiplier, and so does a policy whose rewards vary less than they did.
+      unit of cost, as in the code of Ray et al. 2019. A cost in another unit needs another
+      multiplier, and so does a policy whose rewards vary less than before.
     - With the scale of :func:`cost_advantage_scale` (``normalize_cost_advantage=True`` of the
       losses) a multiplier has no unit: it says how many standard deviations of the reward
       advantage one standard deviation of the cost advantage is worth.
@@ -45,13 +44,13 @@ def scaled_advantages(
 
     Keyword Args:
         cost_scale (Tensor, optional): what the advantages of the costs are divided by, shape
-            ``(k,)``; one of 0 divides nothing. Defaults to ``None``, the unit of the cost.
+            ``(k,)``; where it is 0, nothing is divided. Defaults to ``None``, the unit of the cost.
         counted (Tensor, optional): the steps that count, bool, shape ``(*B, 1)``. Defaults to
             ``None``, all of them.
-        standardize (bool, optional): whether the reward advantage is, ``False`` where something
+        standardize (bool, optional): standardize the reward advantage. Pass ``False`` if something
             else scales it. Defaults to ``True``.
-        exclude_dims (sequence of int, optional): dimensions of the reward advantage that are
-            standardized each on its own, such as that of the agents. Defaults to ``()``.
+        exclude_dims (sequence of int, optional): dimensions of the reward advantage along which
+            each entry is standardized by itself, such as that of the agents. Defaults to ``()``.
 
     Returns:
         Both advantages, scaled.
@@ -85,10 +84,10 @@ def cost_advantage_scale(
         \sigma \leftarrow \max\big(s,\ m \sigma + (1 - m) s\big), \qquad
         s = \mathrm{std}(A_c)
 
-    The standard deviation of the batch if it is the largest so far, and else a slow approach to
-    it from above. A policy that has learnt to keep away from a cost sees it rarely: what is left of
-    the advantage is then mostly the noise of the critic, which a division by the batch's own
-    deviation would make as large as the advantage of the reward.
+    The scale rises at once to the standard deviation of the batch, and falls to it slowly. A policy
+    that has learnt to avoid a cost sees it rarely, and its cost advantage is then mostly the noise
+    of the critic. Dividing by the batch's own deviation would make that noise as large as the
+    advantage of the reward.
 
     Args:
         past (Tensor): the scale until now, shape ``(k,)``; 0 at the start.
@@ -206,12 +205,12 @@ def penalized_advantage(
 
 
 def per_step(episode_length: float | None, gamma: Tensor) -> Tensor | float:
-    r"""What turns an amount per episode into one per step, the unit of a surrogate.
+    r"""Returns the factor from an amount per episode to one per step, the unit of a surrogate.
 
-    A surrogate is a mean over steps, a violation one over whole episodes. The papers take
-    :math:`1 - \gamma`, as if every episode had :math:`1 / (1 - \gamma)` steps: one of 40 steps,
-    discounted by 0.99, is then taken for one of 100, and a change of the policy for 2.5 times the
-    change of its cost.
+    A surrogate is a mean over steps, a violation a mean over whole episodes. The papers take
+    :math:`1 - \gamma`, as if every episode had :math:`1 / (1 - \gamma)` steps. With a discount of
+    0.99 an episode of 40 steps then counts as one of 100, and a change of the policy seems to
+    change the cost 2.5 times as much as it does.
 
     Args:
         episode_length (float, optional): mean number of steps of an episode; if ``None``,

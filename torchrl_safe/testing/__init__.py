@@ -1,7 +1,7 @@
-"""What people who write losses and multiplier rules test them with. Needs TorchRL only.
+"""Checks for losses and multiplier rules of your own. Needs TorchRL only.
 
-Checks are functions that raise an :class:`AssertionError` which says what differs, so they work
-in every test runner. Losses are given as callables, since a check makes several:
+A check is a function that raises an :class:`AssertionError` which says what differs, so it works
+in every test runner. Pass a loss as a callable, since a check makes several:
 ``check_loss(MyLoss, ClipPPOLoss)`` runs all checks of an on-policy loss, :func:`check_q_loss` those
 of an off-policy one, and each can be called by itself.
 """

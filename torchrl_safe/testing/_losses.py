@@ -18,15 +18,32 @@ Constrain = Callable[[LossModule, Tensor], None]
 
 
 def set_multiplier(loss: LossModule, strength: Tensor) -> None:
-    """Puts a loss under constraint by its multipliers: they take the values of ``strength``."""
+    """Sets the multipliers of a loss to ``strength``, shape ``(k,)``.
+
+    Examples:
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> from torchrl_safe.testing import make_networks, set_multiplier
+        >>> loss = PPOLagrangianLoss(*make_networks(num_costs=2), num_costs=2)
+        >>> set_multiplier(loss, torch.tensor([0.0, 2.5]))
+        >>> loss.lagrange_multiplier
+        tensor([0.0000, 2.5000])
+    """
     loss.lagrange_multiplier.copy_(strength)
 
 
 def set_violation(loss: LossModule, strength: Tensor) -> None:
-    """Puts a loss that has no multipliers, as P3O, IPO and CRPO, under constraint.
+    """Sets the violations of a loss without multipliers, such as P3O, IPO and CRPO.
 
-    A cost with a strength above 0 exceeds its limit by that much; one with a strength of 0 is as
-    far below its limit as a number can be, so that there is nothing to do about it.
+    A cost with a ``strength`` above 0 exceeds its limit by that much. One with a strength of 0 is
+    so far below its limit that it has no effect.
+
+    Examples:
+        >>> from torchrl_safe.objectives import P3OLoss
+        >>> from torchrl_safe.testing import make_networks, set_violation
+        >>> loss = P3OLoss(*make_networks(num_costs=2), num_costs=2)
+        >>> set_violation(loss, torch.tensor([0.0, 2.5]))
+        >>> loss.cost_violation
+        tensor([-1.0000e+30,  2.5000e+00])
     """
     loss.cost_violation.copy_(torch.where(strength > 0, strength, -1e30))
 

@@ -191,6 +191,19 @@ def run_epochs(
         optimizer (torch.optim.Optimizer): the optimizer.
         buffer (ReplayBuffer): what the minibatches are drawn from.
         num_epochs (int, optional): passes over the buffer. Defaults to ``2``.
+
+    Examples:
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> from torchrl_safe.testing import make_batch, make_networks
+        >>> loss = PPOLagrangianLoss(*make_networks())
+        >>> buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=16)
+        >>> data = loss.estimate_advantages(make_batch()).reshape(-1)
+        >>> indices = buffer.extend(data)
+        >>> before = loss.actor_network_params.detach().clone()
+        >>> optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
+        >>> run_epochs(loss, optimizer, [buffer.sample()], num_epochs=1)
+        >>> bool((loss.actor_network_params != before).any())
+        True
     """
     for _ in range(num_epochs):
         for minibatch in buffer:
@@ -232,6 +245,15 @@ def train_on_bandit(
 
     Returns:
         For each batch the share of action A, shape (T,), and what ``read`` returned.
+
+    Examples:
+        >>> from functools import partial
+        >>> from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
+        >>> make_loss = partial(PPOLagrangianLoss, entropy_bonus=False)
+        >>> make_updater = partial(DualAscent, lr=1.0)
+        >>> shares, multipliers = train_on_bandit(make_loss, make_updater, num_batches=3)
+        >>> shares.shape, multipliers.shape
+        (torch.Size([3]), torch.Size([3, 2]))
     """
     torch.manual_seed(seed)
     env = ConstrainedBandit(num_costs)

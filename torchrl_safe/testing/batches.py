@@ -18,10 +18,10 @@ from torchrl_safe.testing.networks import (
 def make_batch(num_costs: int = 1, *, seed: int = 1) -> TensorDictBase:
     """Makes a batch as a collector returns it: four trajectories of six steps.
 
-    A step follows from the one before, but for the ends of episodes: the first row runs through,
-    the second terminates on the way, the third is truncated, the fourth is both, one after the
-    other. Log-probabilities are those of another policy than :func:`make_networks` makes, so that
-    ratios are far from 1. The global random number generators are left as they were.
+    Each step continues the one before, except where an episode ends: the first row has no end, the
+    second terminates on the way, the third is truncated, and in the fourth both happen, one after
+    the other. Log-probabilities are those of another policy than :func:`make_networks` makes, so
+    that ratios are far from 1. The global random number generators are left as they were.
 
     Args:
         num_costs (int, optional): number k of costs. Cost i is uniform in [0, i + 1].

@@ -40,8 +40,8 @@ def check_equals_at_zero(
 ) -> None:
     """Checks that a loss whose multipliers are 0 is another loss, bit for bit.
 
-    Compared are the outputs, the gradients of each of them, the state of the random number
-    generator after a call, and the weights after some updates with Adam on minibatches.
+    It compares the outputs, the gradients of each of them, the state of the random number generator
+    after a call, and the weights after some updates with Adam on minibatches.
 
     Args:
         make_loss (callable): makes the loss, called as ``make_loss(actor, critic, cost_critic,
@@ -55,9 +55,9 @@ def check_equals_at_zero(
             :func:`make_networks` does. :func:`make_q_networks` is for off-policy losses.
         make_data (callable, optional): makes what the loss is called with, as
             :func:`make_minibatch` does. :func:`make_transitions` is for off-policy losses.
-        constrain (callable, optional): how the loss is put under constraint, called with the loss
-            and the strength of each constraint, shape (k,). A strength of 0 takes the constraint
-            off. Defaults to :func:`set_multiplier`.
+        constrain (callable, optional): applies constraints to a loss, called with the loss and
+            the strength of each constraint, shape (k,). A strength of 0 removes the constraint.
+            Defaults to :func:`set_multiplier`.
 
     Raises:
         AssertionError: if anything differs. It names the output, the gradient or the weight.

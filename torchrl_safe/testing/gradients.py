@@ -110,9 +110,8 @@ def check_masked_steps(
 ) -> None:
     """Checks that steps which a mask leaves out count nowhere in the ``loss_*`` outputs.
 
-    The mask is TorchRL's ``("collector", "mask")``. What the masked steps hold must have no
-    effect; and if the loss draws no random numbers, its outputs must be those of the data without
-    these steps.
+    The mask is TorchRL's ``("collector", "mask")``. The values of masked steps must have no effect.
+    If the loss draws no random numbers, its outputs must be those of the data without these steps.
 
     Args:
         make_loss (callable): see :func:`check_equals_at_zero`.

@@ -344,6 +344,10 @@ def check_compile(
     Raises:
         AssertionError: if an output differs from the loss's, or a second graph is traced.
         torch._dynamo.exc.Unsupported: if the loss cannot be one graph.
+
+    Examples:
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> check_compile(PPOLagrangianLoss)
     """
     loss, data = build(make_loss, make_networks, num_costs), make_data(num_costs)
     backend = _Counter()

@@ -38,6 +38,11 @@ def make_actor(
     Args:
         observation (NestedKey, optional): key of the observation, of 4 numbers.
         action (NestedKey, optional): key of the action, of 2 numbers.
+
+    Examples:
+        >>> actor = make_actor()
+        >>> actor.in_keys, actor.out_keys
+        (['observation'], ['loc', 'scale', 'action', 'action_log_prob'])
     """
     policy = nn.Sequential(mlp(OBSERVATION_SIZE, 2 * ACTION_SIZE), NormalParamExtractor())
     return ProbabilisticActor(
@@ -60,6 +65,11 @@ def make_critic(
         out_key (NestedKey, optional): what it writes, of shape ``(*B, num_values)``.
         num_values (int, optional): numbers that it predicts.
         observation (NestedKey, optional): key of the observation, of 4 numbers.
+
+    Examples:
+        >>> critic = make_critic("cost_value", num_values=2)
+        >>> critic(observation=torch.zeros(3, 4)).shape
+        torch.Size([3, 2])
     """
     network = mlp(OBSERVATION_SIZE, num_values)
     return ValueOperator(network, in_keys=[observation], out_keys=[out_key])
@@ -115,6 +125,11 @@ def make_q_actor(*, deterministic: bool = False, action: NestedKey = "action") -
         deterministic (bool, optional): return an :class:`~torchrl.modules.Actor` without
             randomness. Defaults to ``False``.
         action (NestedKey, optional): key of the action, of 2 numbers.
+
+    Examples:
+        >>> actor = make_q_actor(deterministic=True)
+        >>> actor(observation=torch.zeros(3, 4)).shape
+        torch.Size([3, 2])
     """
     if deterministic:
         policy = nn.Sequential(mlp(OBSERVATION_SIZE, ACTION_SIZE), nn.Tanh())
@@ -138,6 +153,11 @@ def make_q_critic(
         out_key (NestedKey, optional): what it writes, of shape ``(*B, num_values)``.
         num_values (int, optional): numbers that it predicts.
         action (NestedKey, optional): key of the action, of 2 numbers.
+
+    Examples:
+        >>> critic = make_q_critic("state_action_cost_value", num_values=2)
+        >>> critic(observation=torch.zeros(3, 4), action=torch.zeros(3, 2)).shape
+        torch.Size([3, 2])
     """
     return ValueOperator(_QValue(num_values), in_keys=["observation", action], out_keys=[out_key])
 

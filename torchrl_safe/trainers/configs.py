@@ -49,8 +49,8 @@ def _of(target: str, **arguments: Any) -> dict[str, Any]:
 class ArmEnvConfig(EnvLibsConfig):
     """Configuration of :class:`~torchrl_safe.envs.ArmEnv`.
 
-    What is an object there is a configuration of one here: ``obstacles._target_`` is
-    ``torchrl_safe.envs.InFront`` by default, and a name beside it is an argument of that class.
+    An argument that is an object has a configuration here: ``obstacles._target_`` is
+    ``torchrl_safe.envs.InFront`` by default, and the names beside it are arguments of that class.
     ``arm.path`` is the name of an arm.
     """
 
@@ -161,8 +161,8 @@ class PIDControlConfig(UpdaterConfig):
 class ConstrainedPPOTrainerConfig(PPOTrainerConfig):
     """Configuration of :class:`~torchrl_safe.trainers.ConstrainedPPOTrainer`.
 
-    A ``collector`` with ``_partial_: true`` and no policy of its own gets the policy of the loss;
-    a policy that is configured a second time would be another one.
+    Give the ``collector`` ``_partial_: true`` and no policy: it then gets the policy of the loss. A
+    policy that is configured a second time would be another network.
     """
 
     updater: Any = MISSING

@@ -19,18 +19,18 @@ from torchrl_safe.trainers.multiplier_hook import MultiplierHook
 class ConstrainedPPOTrainer(PPOTrainer):
     """TorchRL's PPO trainer for a loss with costs and a rule that moves its multipliers.
 
-    It is :class:`~torchrl.trainers.algorithms.PPOTrainer` with a :class:`MultiplierHook` and with
-    ``loss_module.estimate_advantages`` in the place of its GAE: as there, advantages are estimated
-    anew in each epoch, with the critics as they are then. TorchRL marks its trainers as
-    experimental, and warns so.
+    It is :class:`~torchrl.trainers.algorithms.PPOTrainer` with a :class:`MultiplierHook`, and with
+    ``loss_module.estimate_advantages`` in place of its GAE. Like ``PPOTrainer`` it estimates
+    advantages anew in each epoch, with the current critics. TorchRL warns that its trainers are
+    experimental.
 
     Keyword Args:
         loss_module (LossModule): :class:`~torchrl_safe.objectives.PPOLagrangianLoss`,
             :class:`~torchrl_safe.objectives.LagrangianLoss` or any other on-policy loss with a
             cost critic that one optimizer minimizes as it stands.
         updater (MultiplierUpdater or ViolationUpdater): moves the multipliers of ``loss_module``.
-        frame_skip (int, optional): factor of the frame count. Defaults to ``1``, whatever the
-            environment repeats within a step.
+        frame_skip (int, optional): factor of the frame count. Defaults to ``1``, even if the
+            environment repeats actions within a step.
         optim_steps_per_batch (int, optional): steps of the optimizer in an epoch. Defaults to
             ``None``, all minibatches of the replay buffer.
         gamma (float, optional): discount of reward and costs, with ``lmbda``. Defaults to what
@@ -49,7 +49,7 @@ class ConstrainedPPOTrainer(PPOTrainer):
 
     Raises:
         TypeError: if ``loss_module`` has no cost critic, or ``updater`` is no updater.
-        ValueError: if ``loss_module`` wants another kind of loop, or see :class:`MultiplierHook`.
+        ValueError: if ``loss_module`` needs another kind of loop; see also :class:`MultiplierHook`.
 
     Like ``PPOTrainer`` it sets the keys of the loss: pass ``reward_key``, ``done_key``,
     ``terminated_key`` and ``action_key`` here, and only the keys of the costs to

@@ -16,9 +16,9 @@ from torchrl_safe.objectives.rules.cost_updater import CostUpdater, check_names
 class MultiplierHook(TrainerHookBase):
     """Steps an updater with the costs of the episodes that ended in each collected batch.
 
-    It acts once for each batch, before anything is learned from it, in any
-    :class:`~torchrl.trainers.Trainer` whose collector yields its batches: PPO's, SAC's, one of
-    your own. The environment sums up the costs of an episode, with
+    It acts once for each batch, before the trainer learns from it, in any
+    :class:`~torchrl.trainers.Trainer` whose collector yields batches: PPO's, SAC's or your own. Sum
+    up the costs of an episode in the environment, with
     ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])``.
 
     Args:

@@ -11,7 +11,7 @@ from torchrl_safe.envs.regions import Region
 
 @dataclass(frozen=True)
 class Gripper:
-    """A gripper that can be mounted on any arm. Its fingers open alike, as if by a gear.
+    """A gripper for any arm, whose fingers open by the same amount.
 
     Args:
         urdf: path of the URDF file, as that of an :class:`ArmModel`.
@@ -53,14 +53,13 @@ class ArmModel:
             is mounted on it.
         home: joint angles at the start of an episode, in radians, one for each joint of the
             arm. Cartesian actions keep the tool orientation of this pose.
-        goals: where goals can be reached with the tool held as at home, in the frame of the
-            arm's base, m.
-        finger_home: position of the joints that are not part of the arm, in metres, where they
-            are free.
+        goals: box in which the arm reaches every point with the tool turned as at home, in the
+            frame of the arm's base, m.
+        finger_home: position of free finger joints at the start of an episode, m.
         gripper: what is mounted on ``ee_link``; its ``tool_link`` then is the tool point.
         handling_orientation: tool orientation, a quaternion (x, y, z, w), that keeps the arm off
-            an obstacle beside the object that it pushes or picks up: give it to
-            :class:`~torchrl_safe.envs.CartesianDelta`. ``None`` is that of the home pose.
+            an obstacle beside the object that it pushes or picks up. Pass it to
+            :class:`~torchrl_safe.envs.CartesianDelta`. ``None`` stands for the home pose's.
 
     Raises:
         TypeError: if ``goals`` or ``gripper`` is not of its kind. A file, link or home pose that
@@ -89,9 +88,9 @@ class ArmModel:
             keep_numbers(self, "handling_orientation", 4)
 
 
-# Turned by a quarter, a hand shows its narrow side to what is beside the object; to which side,
-# decides where the elbow of an arm with seven joints goes. The wrist of a UR hangs too low for
-# that: leaning, it stays back.
+# Turned by a quarter, a hand has its narrow side to what is beside the object. The direction of the
+# turn decides where the elbow of an arm with seven joints goes. The wrist of a UR hangs too low for
+# that, so its hand leans back instead.
 _LEFT, _RIGHT = (
     (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
     (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),

@@ -1,4 +1,4 @@
-"""Rewrites URDF files into what the physics needs and nothing more."""
+"""Rewrites URDF files into what the physics needs, and nothing more."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool, merge: bool
     Args:
         arm: the arm.
         visuals: keep the visual shapes, which cost memory and load time.
-        fix_fingers: fix every joint that does not move the tool: a Panda's two fingers are
-            half of the cost of a physics step.
-        merge: make one link of those that fixed joints hold together; the tool's frame stays.
+        fix_fingers: fix every joint that does not move the tool. A Panda's two fingers take
+            half of the time of a physics step.
+        merge: make one link of those that fixed joints hold together, except the tool's frame.
 
     Raises:
         ValueError: if a file is missing or not XML, a mesh is missing or there is no such link.

@@ -14,9 +14,9 @@ _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 def merge_fixed_links(root: Element, keep: str) -> None:
     """Merges every link that a fixed joint holds into the link that holds it.
 
-    Shapes move over, masses and inertias add up: it is the same body, only cheaper to simulate.
-    (But an engine may make its own inertia of the box around a link's shapes, which is another
-    one when there are more shapes.)
+    The merged link has all shapes, and the sum of masses and inertias. It is the same body, cheaper
+    to simulate. (An engine that takes the inertia of the box around a link's shapes gets another
+    one.)
 
     Args:
         root: a URDF; changed in place.
@@ -109,7 +109,7 @@ def _place(element: Element, frame: Array) -> None:
     turn = frame[:3, :3]
     level = np.hypot(turn[0, 0], turn[1, 0])
     roll, yaw = np.arctan2(turn[2, 1], turn[2, 2]), np.arctan2(turn[1, 0], turn[0, 0])
-    # Straight up or down roll and yaw turn about the same axis: one of them does it all.
+    # Straight up or down, roll and yaw turn about the same axis: one of them is enough.
     if level < 1e-9:
         roll, yaw = np.arctan2(-turn[1, 2], turn[1, 1]), 0.0
     origin.set("xyz", _text(frame[:3, 3]))

@@ -19,8 +19,8 @@ class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Observations and actions are float32 of shape ``(width,)``; actions beyond the bound of the
     action mode are clipped. ``step`` gives in its info ``cost`` (the sum of the costs),
     ``costs`` (each by its name) and ``is_success``, with a shield also ``shield_correction``, rad,
-    and ``shield_braked``. ``reset(seed=...)`` decides on everything
-    that follows, bit for bit.
+    and ``shield_braked``. Everything after ``reset(seed=...)`` follows from that seed,
+    bit for bit.
 
     The time limit is the arm's own and sets ``truncated``. ``gymnasium.make`` keeps the argument
     ``max_episode_steps`` for a wrapper of its own, which can shorten the limit, not lengthen it.

@@ -1,4 +1,4 @@
-"""Vectorized environments that reset themselves: what a step returned before they did.
+"""What a vectorized environment returned in a step before it reset itself.
 
 Since Gymnasium 1.1 a vectorized environment names its mode; before, as in the 0.28 that
 Safety-Gymnasium needs, each of them resets in the step that ends an episode. The last observation

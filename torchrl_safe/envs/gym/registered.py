@@ -21,7 +21,7 @@ ARMS = {
 }
 #: Tasks, by the second part.
 TASKS: dict[str, Task] = {"Reach": Reach(), "Push": Push(), "PickAndPlace": PickAndPlace()}
-# Control steps of an episode, at 20 Hz; mostly enough for the scripted pilots of the tests.
+# Control steps of an episode at 20 Hz. The scripted policies of the tests mostly need no more.
 _TIME_LIMITS = {"Reach": 40, "Push": 200, "PickAndPlace": 100}
 #: Layouts of obstacles, by the third part, which may be empty.
 OBSTACLES: dict[str, Obstacles] = {
@@ -40,10 +40,10 @@ def combination(arm: str, task: str, obstacles: str, action: str) -> dict[str, A
 
     Args:
         arm: key of ``ARMS``.
-        task: key of ``TASKS``; decides on the time limit too: 40 control steps for ``Reach``, 200
+        task: key of ``TASKS``; sets the time limit too: 40 control steps for ``Reach``, 200
             for ``Push``, 100 for ``PickAndPlace``.
         obstacles: key of ``OBSTACLES``.
-        action: key of ``ACTIONS``. To pick something up, it moves the fingers too.
+        action: key of ``ACTIONS``. For ``PickAndPlace`` the action also moves the fingers.
 
     Examples:
         >>> from torchrl_safe.envs import ArmEnv

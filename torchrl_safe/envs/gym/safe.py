@@ -192,13 +192,13 @@ class SafeGymWrapper(_CostBesideReward):
 
     ``cost`` of shape ``(*batch, k)``, float32, is part of the reward spec, beside ``reward``. It is
     read from the info of ``step``, or, for the name ``"cost"``, from its third output where there
-    are six, as in Safety-Gymnasium. ``reset`` returns none.
+    are six, as in Safety-Gymnasium. ``reset`` returns no cost.
 
-    Vectorized environments may reset in the modes that TorchRL supports, ``DISABLED`` and
-    ``SAME_STEP``; the last observation, reward and cost of an episode are the true ones in both,
-    and in the vectorized environments of Gymnasium 0.28 and Safety-Gymnasium, which know no modes.
-    Gymnasium gives an entry of a vectorized info the type it has in the first environment: a cost
-    must be a float everywhere, or its fractions are lost.
+    Vectorized environments may use the autoreset modes that TorchRL supports, ``DISABLED`` and
+    ``SAME_STEP``. In both, and in the vectorized environments of Gymnasium 0.28 and
+    Safety-Gymnasium, which have no modes, you get the true last observation, reward and cost of an
+    episode. Make each cost a float: Gymnasium gives an entry of a vectorized info the type that it
+    has in the first environment, and fractions are lost if that is an integer.
 
     Args:
         env (gymnasium.Env or gymnasium.vector.VectorEnv): the environment.
@@ -237,11 +237,11 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
         cost_keys (Sequence[NestedKey], optional): the entries of ``info`` that are costs.
             Defaults to ``("cost",)``.
         num_envs (int, optional): number of environments in a batch. Defaults to ``0``: one
-            environment without a batch dimension. TorchRL's ``num_workers`` acts on its own
-            ``GymEnv`` only; :class:`~torchrl.envs.ParallelEnv` does the same.
+            environment without a batch dimension. (TorchRL's ``num_workers`` has no effect here;
+            use :class:`~torchrl.envs.ParallelEnv`.)
         asynchronous (bool, optional): with ``num_envs``, whether each environment has a process of
-            its own. If not they step one after the other in this process, which is faster for
-            those whose step takes less than about a millisecond. Defaults to ``True``.
+            its own. If not, they step one after the other in this process, which is faster if a
+            step takes less than about a millisecond. Defaults to ``True``.
         **kwargs: arguments of :class:`~torchrl.envs.GymEnv` and of the environment.
 
     Examples:

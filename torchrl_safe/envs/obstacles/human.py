@@ -13,7 +13,7 @@ from torchrl_safe.envs.obstacles.shapes import Capsule, Look, Part, Shape, Spher
 from torchrl_safe.envs.rotations import from_z_axis
 from torchrl_safe.envs.state import Array
 
-# Reaches before the motion repeats itself: more than the usual episode has time for.
+# Reaches before the motion repeats itself. An episode of the usual length has fewer.
 _REACHES = 16
 _SPREAD = 0.08
 # Lengths in m; the hand is the far end of the forearm, the head is given from the shoulder.
@@ -21,7 +21,7 @@ _UPPER_ARM, _FOREARM, _HEAD = 0.28, 0.35, (0.05, -0.2, 0.25)
 # Colours of what is drawn.
 _SKIN, _HAIR, _EYE = (0.90, 0.69, 0.55), (0.27, 0.17, 0.10), (0.05, 0.05, 0.05)
 _SHIRT, _TROUSERS = (0.53, 0.33, 0.66), (0.25, 0.27, 0.38)
-# Between these distances of hand and shoulder the elbow is neither stretched nor folded flat.
+# Between these distances from hand to shoulder the elbow is neither straight nor folded flat.
 _NEAREST, _REACH = 0.12, 0.62
 
 
@@ -29,7 +29,7 @@ _NEAREST, _REACH = 0.12, 0.62
 class Human:
     """A person opposite the arm: capsules for upper arm and forearm with the hand, and a head.
 
-    Pictures show the rest of the body too, which collides with nothing.
+    Pictures also show the rest of the body, which cannot be touched.
 
     The hand waits beside the shoulder, reaches for a point on the way from start to goal, rests
     there for a while, goes back and begins again with another point. It moves along straight
@@ -38,7 +38,7 @@ class Human:
     0.28 m, forearm and fist 0.35 m; Winter 2009, Biomechanics and Motor Control of Human
     Movement).
 
-    The person does not yield: it follows its way whatever it hits.
+    The person does not yield to the arm.
 
     Args:
         shoulder: position of the shoulder, m.
@@ -91,7 +91,7 @@ class Human:
         targets = start + along * (goal - start) + rng.uniform(-_SPREAD, _SPREAD, (_REACHES, 3))
         # The centre of the hand stays above the table.
         targets[:, 2] = np.maximum(targets[:, 2], 0.08)
-        # What is too far away is reached for as far as the arm is long.
+        # The hand goes towards a point that is too far away, as far as the arm is long.
         shoulder = np.array(self.shoulder)
         distance = np.linalg.norm(targets - shoulder, axis=1, keepdims=True)
         targets = shoulder + np.minimum(1, _REACH / distance) * (targets - shoulder)

@@ -99,7 +99,21 @@ class Placement:
 
 @runtime_checkable
 class Obstacles(Protocol):
-    """Protocol of a layout of obstacles: their shapes, and where they are in an episode."""
+    """Protocol of a layout of obstacles: their shapes, and where they are in an episode.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, Box
+        >>> class Gate:
+        ...     shapes = (Box((0.02, 0.02, 0.15)),) * 2
+        ...
+        ...     def sample(self, rng, start, goal):
+        ...         beside = np.array([[0, -0.15, 0], [0, 0.15, 0]])
+        ...         return Placement(np.array([goal[0], goal[1], 0.15]) + beside)
+        >>> env = ArmEnv(obstacles=Gate())
+        >>> env.reset()["observation"].shape
+        torch.Size([1, 57])
+        >>> env.close()
+    """
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
@@ -118,7 +132,7 @@ class Obstacles(Protocol):
             goal: target position, m, shape ``(3,)``.
 
         Raises:
-            NoRoomError: if they find no room here. The environment draws another goal.
+            NoRoomError: if there is no room for them. The environment then draws another goal.
         """
 
 
@@ -147,8 +161,8 @@ class InFront:
         gap: horizontal distance between the target and the obstacle's centre, m.
         shape: the obstacle.
         direction: horizontal direction in which the obstacle is passed on the way to the
-            target. ``None`` takes that from start to target, so that the obstacle always
-            stands in the way.
+            target. ``None`` takes the direction from start to target, so that the obstacle is
+            always in the way.
         height: height of the obstacle's centre, m. ``None`` stands it on the table.
 
     Raises:

@@ -25,7 +25,18 @@ def _unit(direction: tuple[float, float, float] | None, across: Array) -> Array:
 
 @runtime_checkable
 class Motion(Protocol):
-    """Protocol of a motion for :class:`Moving`."""
+    """Protocol of a motion for :class:`Moving`.
+
+    Examples:
+        >>> class Away:
+        ...     def sample(self, rng, across):
+        ...         speed = rng.uniform(0.05, 0.1)  # m/s
+        ...         return lambda times: speed * times[:, None] * across
+        >>> layout = Moving(motion=Away())
+        >>> displacement = Away().sample(np.random.default_rng(0), np.array([0.0, 1.0, 0.0]))
+        >>> displacement(np.array([0.0, 1.0])).shape
+        (2, 3)
+    """
 
     def sample(self, rng: np.random.Generator, across: Array) -> Callable[[Array], Array]:
         """Draws one obstacle's motion: maps times, s, ``(s,)``, to displacements, m, ``(s, 3)``.
@@ -76,12 +87,12 @@ class Swing:
 
 @dataclass(frozen=True)
 class Patrol:
-    """Back and forth at constant speed, from a random point of the way.
+    """Back and forth at constant speed, from a random point of the path.
 
     Args:
-        distance: length of the way, m; its middle is where the layout puts the obstacle.
+        distance: length of the path, m; its middle is where the layout puts the obstacle.
         speed: m/s.
-        direction: of the way; its length does not matter. ``None`` takes the horizontal across
+        direction: of the path; its length does not matter. ``None`` takes the horizontal across
             the way from start to goal.
 
     Raises:
@@ -114,9 +125,9 @@ class Patrol:
 
 @dataclass(frozen=True)
 class Moving:
-    """Any layout, in motion. The obstacles follow their way whatever they hit.
+    """Any layout, in motion. The obstacles keep to their paths and yield to nothing.
 
-    Only their places at the start are checked to leave the arm at home and the objects free.
+    Only their places at the start are checked: they leave the arm at home and the objects free.
 
     Args:
         layout: where the obstacles are; must be fixed shapes (mass 0).

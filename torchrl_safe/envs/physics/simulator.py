@@ -1,9 +1,9 @@
 """What :class:`~torchrl_safe.envs.ArmEnv` asks of a physics engine, and nothing more.
 
 Two protocols: a :class:`Physics` is the frozen object that a user passes
-(``ArmEnv(physics=Bullet())``), and builds the :class:`Simulator` of an environment. Each engine
-has a folder beside this file, the only place that imports or names it. An engine that is not
-installed is told by :meth:`Physics.build`, not by an import of ours.
+(``ArmEnv(physics=Bullet())``); it builds the :class:`Simulator` of an environment. Each engine
+has a folder beside this file, the only place that imports or names it. If an engine is not
+installed, :meth:`Physics.build` raises an ImportError.
 
 Units are SI, coordinates are those of the world, orientations are quaternions (x, y, z, w). N is
 the number of worlds, n of arm joints, f of free finger joints, p of objects, m of obstacles.
@@ -51,8 +51,8 @@ class Nearest(NamedTuple):
 class Simulator(Protocol):
     """N worlds of the same build, each with one arm on a table whose top is at height 0.
 
-    Worlds do not depend on each other: what happens in a row is the same, bit for bit, whatever
-    the other rows do, and whatever has happened in this row before its last :meth:`reset`.
+    Worlds do not depend on each other. What happens in a row is the same, bit for bit, whatever
+    the other rows do, and whatever happened in this row before its last :meth:`reset`.
     """
 
     @property
@@ -102,8 +102,8 @@ class Simulator(Protocol):
         """Takes a control step of ``frame_skip`` substeps in all worlds.
 
         The motors' targets move evenly from where joints and fingers are to what is given, in
-        equal parts over the substeps: at the end of the control step they are there to within
-        5 % of the way, where efforts and speeds allow.
+        equal parts over the substeps. At the end of the control step they have arrived to within
+        5 % of the way, if efforts and speeds allow.
 
         Every substep reads the contacts of arm and obstacles, and what the sensing asks for:
         contact points are those on which the substep's forces acted; everything else is as it is
@@ -121,8 +121,8 @@ class Simulator(Protocol):
     def state(self) -> ArmState:
         """Returns the state of all worlds after the last :meth:`advance`, or reset of a row.
 
-        In arrays of its own: later steps do not change them. ``step`` counts the control steps
-        since the row's reset, of which :meth:`restore` brings back the number too; ``time`` is
+        The arrays are new: later steps do not change them. ``step`` counts the control steps
+        since the row's reset, and :meth:`restore` brings it back; ``time`` is
         that times ``frame_skip`` times :data:`~torchrl_safe.envs.physics.scene.SUBSTEP`.
         """
 
@@ -130,7 +130,7 @@ class Simulator(Protocol):
         """Returns where the tool is at given joint angles.
 
         For the search of start poses, which need not be fast. It may move the arm of any
-        world: reset them before they go on.
+        world, so reset the worlds afterwards.
 
         Args:
             joints: joint angles, rad, ``(k, n)``, for any k.
@@ -160,7 +160,7 @@ class Simulator(Protocol):
     def nearest(self, rows: NDArray[np.int_], joints: Array, fingers: Array) -> Nearest:
         """Measures how far the arm would be from obstacles and table, in some of the worlds.
 
-        What of the arm only turns about vertical axes may be left out beside the table. It
+        For the table, an engine may leave out links that only turn about vertical axes. The call
         changes nothing in any world.
 
         Args:
@@ -201,7 +201,14 @@ class Simulator(Protocol):
 
 @runtime_checkable
 class Physics(Protocol):
-    """A physics engine with its options: a frozen object, which can be copied and pickled."""
+    """A physics engine with its options: a frozen object, which can be copied and pickled.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, Bullet
+        >>> isinstance(Bullet(), Physics)
+        True
+        >>> ArmEnv(physics=Bullet()).close()
+    """
 
     def build(
         self,

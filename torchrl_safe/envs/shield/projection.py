@@ -10,7 +10,7 @@ from torchrl_safe.envs.state import Array
 # Constraints are added one by one, and now and then dropped again: a few times the number of
 # unknowns is enough. A problem that takes more is given up.
 _ITERATIONS_PER_UNKNOWN = 8
-# Constraints have unit length: how far beyond one is not beyond it, and what is parallel.
+# Tolerances for constraints of unit length: to be beyond one, and to be parallel.
 _TOLERANCE, _PARALLEL = 1e-9, 1e-10
 
 

@@ -15,14 +15,14 @@ from torchrl_safe.envs.shield.projection import project
 from torchrl_safe.envs.state import ArmState, Array
 from torchrl_safe.envs.vectors import cross
 
-# The nearest point of a shape may be another one at the end of a control step, and the way is
-# curved: for each radian that the joints turn, a distance can be off by this much, m.
+# At the end of a control step another point of a shape may be the nearest, and points move on
+# curves. For each radian that the joints turn, a distance can be off by this much, m.
 _ERROR = 0.1
-# Of what the joints hardly move, m/rad, and of joints without limits, rad.
+# For what the joints hardly move, m/rad, and for joints without limits, rad.
 _SHORTEST, _FAR = 1e-3, 1e3
-# What is no distance, m.
+# Below this, a distance counts as 0, m.
 _TOLERANCE = 1e-9
-# Of what the joints can do to stop, the part that is counted on: others may have to turn on.
+# The share of the joints' braking that a distance counts on: some joints may have to keep turning.
 _SURE = 1 / 3
 
 
@@ -31,7 +31,7 @@ class Shielded(NamedTuple):
 
     #: Joint targets, rad, ``(N, n)``.
     joints: Array
-    #: Finger targets, m, as they came, or where the fingers are.
+    #: Finger targets, m: those asked for, or where the fingers are.
     fingers: Array
     #: Which worlds brake because nothing that was asked for is safe, ``(N,)``.
     braked: NDArray[np.bool_]
@@ -73,10 +73,10 @@ class _Step(NamedTuple):
 class Shield:
     r"""Filters actions so that the arm touches neither obstacles nor the table.
 
-    Before each control step it measures every convex shape of the arm against every obstacle and
-    the table, and takes the joint targets :math:`q + x` nearest to those asked for,
-    :math:`q + w`, with which no distance d uses up more than s of the room :math:`r = d -
-    \text{margin}` that it has left:
+    Before each control step it measures the distance d of every convex shape of the arm to every
+    obstacle and the table. Each distance has the room :math:`r = d - \text{margin}` left, of which
+    a step may use up s(r). The shield takes the joint targets :math:`q + x` that keep to this and
+    are nearest to those asked for, :math:`q + w`:
 
     .. math::
         \min_x |x - w|^2 \quad\text{such that}\quad
@@ -90,21 +90,21 @@ class Shield:
         s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\ \sqrt{b^2 / 4 + 2 b r} - b / 2\right),
         \qquad b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
 
-    The first part is a share of the room. The second is as much as leaves room to stop in, where
-    the distance shrinks by b less in each following step: a third of what all joints together
-    can do. In negative room, inside the margin, :math:`s = (1 - e^{-\text{rate} \cdot T})
-    r` has the arm go away.
+    The first part is a share of the room. The second leaves enough room to stop if the distance
+    shrinks by b less in each following step; b is a third of what all joints together can do.
+    Inside the margin, where r is negative, :math:`s = (1 - e^{-\text{rate} \cdot T}) r` makes the
+    arm move away.
 
     The bounds l and u keep joints within their limits and speeds, and within what motors can
-    follow: a joint's velocity changes by no more than ``acceleration`` allows, or by no more than
-    takes up the room that is left, whichever is more. So far from everything the shield changes
-    nothing. The solver is exact; what is linear in it is checked: where the end of the step could
-    be too near, the distances there are measured too, and become inequalities of a second problem,
-    in which one more step like this one, slower by b, has to be safe there as well.
+    follow. A joint's velocity changes by no more than ``acceleration`` allows, or by what takes up
+    the remaining room, whichever is more. Far from everything the shield therefore changes nothing.
 
-    If there is no solution, the arm brakes, which the key ``shield_braked`` says: it takes the
-    motion nearest to a stand that does not use up more than all the room, or if there is none, it
-    holds still.
+    The problem treats distances as linear, which is not exact. Where the end of the step could be
+    too near, the shield measures the distances there as well and solves a second problem with them.
+    In it, one more step like this one, slower by b, has to be safe too.
+
+    If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
+    motion that does not use up more than all the room. If there is none, it stands still.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -112,35 +112,33 @@ class Shield:
     - motors follow targets whose velocity changes by no more than ``acceleration``, to within the
       margin,
     - ``reach`` is enough to stop in from the arm's largest speed,
-    - and within a control step the arm does not turn so far that a shape comes near in its middle
-      and leaves again: the distances at both ends are checked, those between follow from them to
-      within the same margin,
-    - and there is a solution. An arm that has to brake from full speed needs some way to do so.
+    - no shape comes near in the middle of a control step and leaves again: only the distances at
+      both ends are checked,
+    - there is a solution. An arm that has to brake from full speed needs some distance for it.
 
-    With obstacles that move, their velocity counts: the arm gives way as far as its joints allow.
-    As their future is unknown, the guarantee is another: the arm is not the one that moves into
-    contact, if they do not become faster than ``obstacle_speed``. The arm's own links and what its
-    gripper holds are not looked at.
+    From moving obstacles the arm withdraws as far as its joints allow. Their future is unknown, so
+    the guarantee is weaker: the arm is not the one that moves into contact, as long as they do not
+    become faster than ``obstacle_speed``. The arm's own links and what its gripper holds are not
+    checked.
 
-    **What is learnt from.** The batch holds the action that the policy sampled, and its
+    **Learning.** The batch holds the action that the policy sampled, and its
     log-probability. The shield is a part of the environment: it maps state and action to joint
     targets, as inverse kinematics and motors do, so the policy gradient is that of the shielded
     environment, unbiased. The executed action has no density under the policy (the filter maps many
-    actions onto the same edge), which is why it is not put in the batch's place. A policy can come
-    to lean on the shield; :class:`~torchrl_safe.envs.ShieldCorrection` is the cost against that.
+    actions onto the same edge), so do not put it into the batch. A policy can learn to rely on the
+    shield; limit the cost :class:`~torchrl_safe.envs.ShieldCorrection` to prevent that.
 
     Args:
         margin: distance that the arm keeps from obstacles, m.
-        rate: largest rate at which what is left above the margin shrinks, 1/s. Smaller slows down
-            from further away.
-        table: distance that the arm keeps from the table, m; it has no edges.
-        reach: distance up to which is measured, m. A larger one takes longer.
-        acceleration: what motors can follow, rad/s^2: within it joints arrive where they are told
-            to.
-        obstacle_speed: if given, obstacles are taken to come as fast as that at any time, m/s,
-            however slow they are now: the arm stops before they could touch it while it moves.
-            ``None`` counts on the velocity that they have.
-        workspace: if given, where the tool point has to stay; it keeps the margin from the walls.
+        rate: largest rate at which the room above the margin shrinks, 1/s. With a smaller one the
+            arm slows down from further away.
+        table: distance that the arm keeps from the table, m. To the shield the table has no edges.
+        reach: distance up to which the shield measures, m. A larger one takes longer.
+        acceleration: change of velocity that the motors follow, rad/s^2.
+        obstacle_speed: if given, the shield expects that obstacles can come this fast at any time,
+            m/s, and stops the arm before they could touch it while it moves. ``None`` expects
+            them to keep their velocity.
+        workspace: if given, the tool point stays in this box, the margin away from its walls.
 
     Raises:
         TypeError: if ``workspace`` is not a Region.
@@ -208,12 +206,12 @@ class Shield:
             least = least - (now.fingers @ opening[:, :, None])[:, :, 0]
         least = _attainable(now.joints, least, lower, upper)
         rows, least = self._with_walls(step, now.joints, least)
-        # What stops above the margin, if nothing leaves room to stop in.
+        # If nothing leaves enough room to stop, take what stops above the margin.
         last = least.copy()
         pairs = now.room.shape[1]
         last[:, :pairs] = np.minimum(last[:, :pairs], now.closing - now.room)
         change, solved, braked = _solve(asked, rows, least, last, lower, upper)
-        # Where the end of the step could be too near, that is measured as well.
+        # Measure the end of the step as well where it could be too near.
         left = now.room - now.closing + (now.joints @ change[:, :, None])[:, :, 0]
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
         again = np.flatnonzero(solved & doubt)
@@ -221,7 +219,7 @@ class Shield:
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
             turned = (then.joints @ change[again][:, :, None])[:, :, 0]
             needed = _needed(step, now.of(again), then) + turned
-            # And one more step like this one, as much slower as it can be, is to be safe there.
+            # One more step like this one, slowed as far as possible, has to be safe there.
             needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.joints))
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
@@ -265,7 +263,7 @@ class Shield:
             arm = near.point - position
             arm -= np.where(np.isfinite(near.distance), near.distance, 0.0)[..., None] * near.normal
             speed = ((velocity + cross(spin, arm)) * near.normal).sum(axis=2)
-            # What goes away may stop at any time.
+            # An obstacle that goes away may stop at any time.
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         spare = self._spare(step, room, joints)
@@ -299,7 +297,7 @@ class Shield:
         angles, turning = state.joint_position, state.joint_velocity * step.duration
         lower = np.clip(state.joint_lower - angles, -longest, longest)
         upper = np.clip(state.joint_upper - angles, -longest, longest)
-        # A joint that is not where it is told to be is off by less than its velocity was to change.
+        # A joint misses its target by less than its velocity was to change.
         # So all together change no distance by more than is left of it.
         levers = np.maximum(np.abs(now.joints).sum(axis=2), _SHORTEST)
         slack = (np.maximum(now.room, 0) / levers).min(axis=1, initial=np.inf)

@@ -1,4 +1,4 @@
-"""Lets environments of others in."""
+"""A cost among the observations becomes one beside the reward."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torchrl.envs import Transform
 class CostToReward(Transform):
     """Moves costs from the observations of an environment to its rewards.
 
-    TorchRL's ``SafetyGymnasiumEnv``, for one, reports its cost as an observation, shape ``()``
-    and float64; ``RewardSum``, ``CostGAE`` and the losses read it as a reward, shape ``(1,)``
+    TorchRL's ``SafetyGymnasiumEnv``, for example, reports its cost as an observation, shape ``()``
+    and float64. ``RewardSum``, ``CostGAE`` and the losses read it as a reward, shape ``(1,)``
     and float32. After this transform ``reward_spec`` is
     ``Composite(reward=(*batch, 1), cost=(*batch, k))`` and neither the observations nor what
     ``reset`` returns have a cost.

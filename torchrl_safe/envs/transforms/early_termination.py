@@ -18,17 +18,17 @@ class EarlyTermination(CostTally):
     https://arxiv.org/abs/2107.04200: with a terminal state that is worth little enough, the best
     policy of the terminated problem is the best that keeps to the budget in every episode, and
     any algorithm without constraints can look for it. The episode ends with the step that
-    exceeds the budget: ``terminated`` and ``done`` become true there and stay what the
-    environment says elsewhere, ``truncated`` always does.
+    exceeds the budget: ``terminated`` and ``done`` become true there. In all other steps, and
+    ``truncated`` always, they are as the environment returns them.
 
-    Value estimators take what follows a termination to be worth 0. That ends well for a task
-    with positive rewards; with negative ones, ending the episode would pay, so pass a
-    ``termination_reward`` below anything that the rest of an episode could earn.
+    Value estimators give what follows a termination the value 0. That is right for a task with
+    positive rewards. With negative ones it pays to end the episode, so pass a
+    ``termination_reward`` below anything that the rest of an episode can earn.
 
-    The sum of each cost so far is an observation of its own: what is left of a budget is part of
+    The sum of each cost so far is an observation of its own, since the remaining budget is part of
     the state. Join it to what the policy sees with :class:`~torchrl.envs.CatTensors`,
     ``del_keys=False``, or leave it out if the budget is 0. A :class:`~torchrl.envs.RewardSum`
-    ahead of this transform sums rewards without ``termination_reward``, one behind it with.
+    before this transform sums rewards without ``termination_reward``, one after it with.
 
     Args:
         budget (float or Tensor): limit of the undiscounted cost of an episode, one number or one

@@ -13,10 +13,10 @@ from torchrl_safe._checks import check_count
 class FrameSkip(FrameSkipTransform):
     """Repeats each action, and sums every reward of the environment, so costs too.
 
-    TorchRL's :class:`~torchrl.envs.FrameSkipTransform`, for environments with more than one
-    reward, for which that raises a KeyError. It also steps on where an episode has ended: here a
-    row keeps its first ``done`` and what came with it, and nothing after that counts.
-    :class:`~torchrl_safe.envs.ArmEnv` needs neither: its own ``frame_skip`` is cheaper.
+    Use it where TorchRL's :class:`~torchrl.envs.FrameSkipTransform` raises a KeyError: in
+    environments with more than one reward. TorchRL's also steps on after an episode has ended. Here
+    a row keeps its first ``done`` and what came with it, and later steps do not count.
+    :class:`~torchrl_safe.envs.ArmEnv` needs neither: its own ``frame_skip`` is faster.
 
     Args:
         frame_skip (int, optional): how often an action is taken. Defaults to ``1``.

@@ -22,16 +22,15 @@ class Saute(CostTally):
     .. math::
         z_0 = 1, \qquad z_{t+1} = \frac{z_t - c_t / d}{\gamma_c},
 
-    which stays at or above 0 just if the discounted cost stays at or below d. In each step
+    which stays at or above 0 if and only if the discounted cost stays at or below d. In each step
     that leaves it below 0 for any of the k costs, the reward is ``unsafe_reward``. Any algorithm
-    without constraints then learns to keep to the budget in every episode, not in the mean of
-    episodes alone. The authors' code counts a budget that is exactly used up as exceeded; here it
-    is not.
+    without constraints then learns to keep to the budget in every episode, not only on average.
+    A budget that is exactly used up is not exceeded here; in the authors' code it is.
 
     The policy has to see the safety state: join it to its observation with
     :class:`~torchrl.envs.CatTensors`, ``del_keys=False``, as below. Costs, termination and
-    truncation stay as they are. A :class:`~torchrl.envs.RewardSum` ahead of this transform sums
-    the rewards of the task, one behind it those that the agent learns from.
+    truncation stay as they are. A :class:`~torchrl.envs.RewardSum` before this transform sums
+    the rewards of the task, one after it those that the agent learns from.
 
     Args:
         budget (float or Tensor): d, the limit of the discounted cost of an episode, one number

@@ -109,14 +109,14 @@ class CostCritic(CostValues):
     def estimate_advantages(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes advantages and value targets of reward and costs, for a whole batch.
 
-        They are scaled over the whole batch, as
-        :func:`~torchrl_safe.objectives.scaled_advantages` says: the reward advantage is
-        standardized (unless the loss has an ``advantage_norm``, which scales it instead), the cost
-        advantages are centred and, with ``normalize_cost_advantage``, divided by a scale that the
-        loss keeps from batch to batch.
-        Steps that the loss leaves out, such as those that pad a trajectory
-        (``("collector", "mask")``), do not count. A call of the loss with a batch without
-        advantages does the same first.
+        It scales them over the whole batch with
+        :func:`~torchrl_safe.objectives.scaled_advantages`. The reward advantage is standardized,
+        unless the loss has an ``advantage_norm``, which scales it instead. The cost advantages are
+        centred and, with ``normalize_cost_advantage``, divided by a scale that the loss keeps from
+        batch to batch. Steps that the loss leaves out, such as those that pad a trajectory
+        (``("collector", "mask")``), do not count.
+
+        If you call the loss with a batch that has no advantages, it does the same first.
 
         Args:
             tensordict (TensorDictBase): a batch as collectors return it, shape ``(*B, T)``.
@@ -224,7 +224,8 @@ class CostCritic(CostValues):
             if self.functional
             else contextlib.nullcontext()
         ):
-            # Of what it reads alone: a value that the data hold is not what it writes.
+            # Give it only what it reads, so that a value in the data is not taken for what it
+            # writes.
             data = tensordict.select(*self._cost_critic_in_keys, strict=False)
             value = get_or_raise(self.cost_critic_network(data), self.tensor_keys.cost_value)
         self._check_width(self.tensor_keys.cost_value, value)

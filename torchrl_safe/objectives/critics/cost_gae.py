@@ -25,10 +25,10 @@ class CostGAE(GAE):
       their shape ``(*B, T, 1)`` and are broadcast over the k costs;
     - with N agents, whose values have the shape ``(*B, T, N, k)``, cost, ``done`` and
       ``terminated`` may be per agent or shared by all, of shape ``(*B, T, k)`` and
-      ``(*B, T, 1)``, as in :class:`~torchrl.objectives.value.MultiAgentGAE`; a shared cost wants
+      ``(*B, T, 1)``, as in :class:`~torchrl.objectives.value.MultiAgentGAE`; a shared cost needs
       a shared ``done``;
-    - the advantages are left as they are: ``estimate_advantages`` of the losses scales those of
-      reward and costs together, with :func:`~torchrl_safe.objectives.scaled_advantages`;
+    - it does not scale the advantages: ``estimate_advantages`` of the losses scales those of reward
+      and costs together, with :func:`~torchrl_safe.objectives.scaled_advantages`;
     - ``vectorized`` defaults to ``True``.
 
     Keyword Args:
@@ -45,7 +45,7 @@ class CostGAE(GAE):
         ValueError: if ``gamma`` or ``lmbda`` is out of its range, or the advantages are to be
             normalized here; in a call, if the cost,
             ``done`` or ``terminated`` of a batch does not fit the shape of its value, or the
-            batch has n-step sums (``"steps_to_next_obs"``), which GAE cannot be made of.
+            batch has n-step sums (``"steps_to_next_obs"``), which GAE cannot use.
 
     Examples:
         >>> import torch
@@ -108,7 +108,7 @@ class CostGAE(GAE):
 
     @property
     def vectorized(self) -> bool:
-        # Asked for at each call: the state that is loaded may bring a discount of 0.
+        # Asked at each call, since a loaded state may bring a discount of 0.
         return bool(super().vectorized and self.gamma * self.lmbda)
 
     @vectorized.setter

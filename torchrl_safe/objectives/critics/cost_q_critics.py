@@ -106,7 +106,8 @@ class CostCriticsMixin(CostValues):
     ) -> TensorDictBase:
         """What the N critics of an ensemble write, shape ``(N, *B)``.
 
-        With ``copies`` each has an input of its own. It is the same, but not its rounding.
+        With ``copies`` each critic gets its own copy of the input. The values are the same up to
+        rounding.
         """
 
         def evaluate(data: TensorDictBase, params: TensorDictBase) -> TensorDictBase:

@@ -24,7 +24,7 @@ class CostTD0(TD0Estimator):
     ``(*B, k)``; ``terminated`` keeps its shape ``(*B, 1)`` and is broadcast over the k costs. A
     truncated episode bootstraps from its last observation, a terminated one does not. After a
     :class:`~torchrl.envs.MultiStepTransform` that sums the cost too (``reward_keys=["reward",
-    "cost"]``, with one ``gamma`` for both), ``"steps_to_next_obs"`` gives the power of it.
+    "cost"]``, with one ``gamma`` for both), the power of ``gamma`` is ``"steps_to_next_obs"``.
 
     Keyword Args:
         gamma (float): discount of the costs, from 0 to 1.

@@ -38,9 +38,9 @@ class SACLagrangianLoss(CostCriticsMixin, SACLoss):
     bit. The differences are:
 
     - an ensemble of critics predicts the k costs, each from the same next action as the reward's;
-      its loss is ``"loss_cost_qvalue"``. Of several predictions of a cost the **largest** counts,
-      in targets and in the actor's objective, as the smallest does for the reward: of two
-      estimates the one to fear is the one that promises too little cost;
+      its loss is ``"loss_cost_qvalue"``. The **largest** of several predictions of a cost counts,
+      in targets and in the actor's objective, as the smallest does for the reward: the dangerous
+      estimate is the one that promises too little cost;
     - the entropy is divided by :math:`1 + \sum_i \lambda_i` along with the reward. The quotient is
       the Lagrangian of the maximum-entropy problem up to a positive factor, so that a temperature
       means the same, in units of reward, whatever the multipliers are;
@@ -50,10 +50,10 @@ class SACLagrangianLoss(CostCriticsMixin, SACLoss):
       cost critics move with :class:`~torchrl.objectives.SoftUpdate`, like the others.
 
     ``SACLoss`` and ``CQLLoss`` keep their own multipliers as the logarithm of a parameter that
-    an optimizer moves along a loss on the minibatch. A limit on the cost of an episode has no
-    such loss: a minibatch of a replay buffer is drawn from many old policies, and its critics
-    predict discounted costs to go. The same rule, a logarithm moved by Adam, on the costs of
-    episodes is ``DualAscent(loss, cost_limit=d, lr=lr, optimizer=torch.optim.Adam,
+    an optimizer moves along a loss on the minibatch. That does not work for a limit on the cost of
+    an episode: a minibatch of a replay buffer comes from many old policies, and critics predict
+    discounted costs. For the same rule, a logarithm moved by Adam, on the costs of episodes, use
+    ``DualAscent(loss, cost_limit=d, lr=lr, optimizer=torch.optim.Adam,
     parametrization=torch.distributions.ExpTransform())``; it needs a ``multiplier_init`` above 0.
 
     Args:

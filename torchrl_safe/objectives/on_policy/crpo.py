@@ -71,8 +71,8 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
     long as every mean episode cost is within its limit and a tolerance, the loss is the wrapped
     one, bit for bit; else its advantage is that of :func:`rectified_advantage`. A
     :class:`~torchrl_safe.objectives.ViolationUpdater` brings the violations, once for each
-    collected batch. The cost then swings about ``cost_limit + tolerance``: the paper takes the
-    policy of a random one of the steps that maximized the reward.
+    collected batch. The cost then swings about ``cost_limit + tolerance``. (The paper returns the
+    policy of a randomly chosen step that maximized the reward.)
 
     The paper takes natural-gradient steps on the advantage; here the wrapped loss decides:
     :class:`~torchrl.objectives.ClipPPOLoss`, :class:`~torchrl.objectives.A2CLoss` and all others

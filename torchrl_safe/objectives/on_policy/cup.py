@@ -64,13 +64,13 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
     r"""Improves the policy with clipped PPO, then projects it towards the limits of k costs.
 
     Presented in "Constrained Update Projection Approach to Safe Policy Optimization", Yang et al.
-    2022 (https://arxiv.org/abs/2209.07089). A batch is gone through in two phases, each of as many
-    epochs as one likes:
+    2022 (https://arxiv.org/abs/2209.07089). You go through a batch in two phases, each of as many
+    epochs as you like:
 
     1. *improvement*: a call of the loss is :class:`~torchrl.objectives.ClipPPOLoss` on the reward,
        bit for bit, beside the loss of the cost critic;
-    2. *projection*: :meth:`start_projection`, once, keeps the policy that this has led to,
-       :math:`\pi_{k + 1/2}`; then :meth:`projection_loss` takes the place of the call.
+    2. *projection*: :meth:`start_projection`, called once, stores the improved policy,
+       :math:`\pi_{k + 1/2}`; then call :meth:`projection_loss` in place of the loss.
 
     ``lagrange_multiplier``, the paper's :math:`\nu`, is a buffer of shape ``(k,)`` that a
     :class:`~torchrl_safe.objectives.MultiplierUpdater` moves, once for each collected batch; the

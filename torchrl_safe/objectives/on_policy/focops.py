@@ -32,13 +32,13 @@ class FOCOPSLoss(ConstrainedPPO, PPOLoss):
     Its two terms are reported apart, ``"loss_kl"`` and ``"loss_objective"``. The multipliers
     :math:`\nu` are the ``lagrange_multiplier`` buffer, of shape ``(k,)``: a
     :class:`~torchrl_safe.objectives.MultiplierUpdater` moves them, the paper's being
-    :class:`~torchrl_safe.objectives.DualAscent`. There is no division by :math:`1 + \sum_i \nu_i`,
-    as there is none in the paper (OmniSafe divides).
+    :class:`~torchrl_safe.objectives.DualAscent`. As in the paper, nothing is divided by
+    :math:`1 + \sum_i \nu_i` (OmniSafe divides).
 
     The divergence is that from the parameters of the distribution that the collector stored, as in
     :class:`~torchrl.objectives.KLPENPPOLoss`; the distribution must be one for which
     :func:`torch.distributions.kl_divergence` is known. The paper also stops the epochs of a batch
-    when the mean divergence exceeds :math:`\delta`: the output ``"kl"`` is for that.
+    when the mean divergence exceeds :math:`\delta`; use the output ``"kl"`` for that.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): policy operator.

@@ -22,8 +22,8 @@ def log_barrier(violation: Tensor, sharpness: Tensor) -> Tensor:
         -\frac{1}{t} \log(-z) \quad \text{for} \quad z \le -\frac{1}{t^2}
 
     (Liu et al. 2019, https://arxiv.org/abs/1910.09615), and beyond that the line of slope
-    t that continues it (Kervadec et al. 2019, https://arxiv.org/abs/1904.04205): a barrier has no
-    value, and so no way back, where its limit is exceeded.
+    t that continues it (Kervadec et al. 2019, https://arxiv.org/abs/1904.04205), because the
+    logarithm is not defined where the limit is exceeded.
 
     Args:
         violation (Tensor): cost minus limit z, any shape.
@@ -52,7 +52,7 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         -\frac{1 - \gamma}{t} \sum_i \log\left(d_i - J_{c_i}(\pi_\theta)\right)
 
     as ``"loss_penalty"``, which acts like a multiplier of :math:`1 / (t (d_i - J_{c_i}))` that
-    nobody has to learn. A :class:`~torchrl_safe.objectives.ViolationUpdater` brings
+    need not be learnt. A :class:`~torchrl_safe.objectives.ViolationUpdater` brings
     :math:`J_{c_i} - d_i` of the policy that collected the batch, once for each of them; the cost
     of the policy that is being trained is estimated from it with PPO's clipped surrogate,
 
@@ -60,16 +60,16 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         J_{c_i}(\pi_\theta) \approx J_{c_i} + \frac{1}{1 - \gamma}
             \mathbb{E}[\max(r A_{c_i}, \mathrm{clip}(r) A_{c_i}) - A_{c_i}],
 
-    :math:`\gamma` being the discount of the cost's value estimator. (The last term, of mean zero
-    over a batch, takes out the noise of minibatches, which the barrier would take for a change of
+    :math:`\gamma` being the discount of the cost's value estimator. (The last term has mean zero
+    over a batch. It removes the noise of minibatches, which the barrier would take for a change of
     the policy.) The factor :math:`1 - \gamma`
     before the barrier is ours: it brings the barrier, which is about episodes, to the unit of
     PPO's objective, which is about steps, so that t means the same whatever the discount.
 
-    A barrier keeps its distance: with one binding cost the policy settles where
-    :math:`t (d - J_c)` is the inverse of the optimal multiplier. The paper presumes a policy that
-    starts within the limits; where one does not, the tangent of :func:`log_barrier` leads back,
-    like a multiplier of t. OmniSafe's implementation gives the collecting policy's
+    A barrier keeps the policy away from the limit: with one binding cost the policy settles where
+    :math:`t (d - J_c)` is the inverse of the optimal multiplier. The paper requires a policy that
+    starts within the limits. From outside, the tangent of :func:`log_barrier` leads back, like a
+    multiplier of t. OmniSafe's implementation gives the collecting policy's
     :math:`1 / (t (d_i - J_{c_i}))` the place of a multiplier, and holds it fixed while the policy
     moves.
 

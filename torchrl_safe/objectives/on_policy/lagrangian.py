@@ -15,14 +15,14 @@ from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
 class LagrangianLoss(ConstrainedLoss, WrappedLoss):
     r"""Puts an advantage loss under constraints on k expected costs.
 
-    The wrapped loss is left as it is; it is given the advantage of
+    The wrapped loss stays as it is, and gets the advantage of
     :func:`~torchrl_safe.objectives.penalized_advantage` instead of the reward's,
 
     .. math::
         A = \frac{A_r - \sum_i \lambda_i A_{c_i}}{1 + \sum_i \lambda_i},
 
-    so that with every multiplier at zero all its outputs and gradients are what they would be
-    without this class, bit for bit. :class:`~torchrl.objectives.A2CLoss`,
+    so with every multiplier at zero all its outputs and gradients are those of the wrapped loss,
+    bit for bit. :class:`~torchrl.objectives.A2CLoss`,
     :class:`~torchrl.objectives.ReinforceLoss`, :class:`~torchrl.objectives.PPOLoss`,
     :class:`~torchrl.objectives.ClipPPOLoss` and :class:`~torchrl.objectives.KLPENPPOLoss` can be
     wrapped. ``lagrange_multiplier`` is a buffer of shape ``(k,)`` that a

@@ -28,8 +28,8 @@ def exact_penalty(
         surrogate (Tensor): mean surrogate :math:`L_{c_i}` of each cost, cost per step, shape
             ``(k,)``.
         violation (Tensor): mean episode cost minus limit, shape ``(k,)``.
-        scale (Tensor or float): steps per episode, inverted: the unit of a violation times this
-            is that of a surrogate.
+        scale (Tensor or float): the factor s, which brings a violation to the unit of a surrogate:
+            1 divided by the steps of an episode.
         coeff (Tensor or float): the factor :math:`\kappa`.
 
     Returns:
@@ -52,13 +52,14 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
     optimal multiplier the penalty is exact. A :class:`~torchrl_safe.objectives.ViolationUpdater`
     brings the violations :math:`J_{c_i} - d_i`, once for each collected batch. While no limit
     binds the penalty is zero, and the loss :class:`~torchrl.objectives.ClipPPOLoss`, bit for bit.
-    The paper does without the term :math:`-A_{c_i}`, of mean zero over a batch: in a minibatch its
-    noise would look like a violation.
+    The term :math:`-A_{c_i}`, of mean zero over a batch, is not in the paper. Without it, the noise
+    of a minibatch would look like a violation.
 
     :math:`\gamma` is the discount of the cost's value estimator. The factor
     :math:`1 - \gamma` turns the cost of an episode into the cost of a step, which is the unit of
     the advantages. OmniSafe's implementation leaves out the factor and the clipping; here both are
-    as in the paper. For episodes of few steps T, a discount of about ``1 - 1 / T`` makes it fit.
+    as in the paper. For episodes of few steps T, choose a discount of about ``1 - 1 / T``, or pass
+    ``episode_length``.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): policy operator.

@@ -25,9 +25,9 @@ def clipped_cost_surrogate(
     .. math::
         \max(r A_c,\ \mathrm{clip}(r) A_c) - A_c
 
-    The last term has mean zero over the batch that was collected, not over a minibatch. Left in,
-    the noise of its mean there would be taken for a change of the policy, and a convex penalty
-    makes that a bias.
+    The last term has mean zero over the collected batch, but not over a minibatch. Without it, a
+    loss would take the noise of a minibatch for a change of the policy, and a convex penalty turns
+    that into a bias.
 
     Args:
         log_weight (Tensor): logarithm of the ratio r that is clipped, shape ``(*B, 1)``.

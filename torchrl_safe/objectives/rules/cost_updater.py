@@ -1,4 +1,4 @@
-"""The front door for the cost of the episodes, shared by all updaters."""
+"""Checks the costs of the episodes, for all updaters."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class CostUpdater(abc.ABC):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads a state that :meth:`state_dict` returned, with its limits and options.
 
-        As torch's optimizers do, it forgets those that this updater was made with; to go on under
+        Like torch's optimizers it replaces those that this updater was made with. To continue with
         another limit, set ``cost_limit`` afterwards.
 
         Raises:

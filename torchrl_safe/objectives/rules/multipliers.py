@@ -15,18 +15,18 @@ from torchrl.objectives import LossModule
 from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
-# A relative violation is judged no more finely than by this share of the limit.
+# A relative violation is divided by at least this share of the limit.
 _SHARE_OF_LIMIT = 0.2
-# What each batch forgets of the scale of violations.
+# Share of the scale of violations that each batch forgets.
 _FORGOTTEN = 0.2
 
 
 class MultiplierUpdater(CostUpdater):
     """Moves the multipliers of a loss towards its cost limits, once for each collected batch.
 
-    A rule is one method, :meth:`next_multiplier`; checking the costs, projecting on
-    ``[0, max_multiplier]`` and writing the buffer in place happen here, in the manner of
-    ``SoftUpdate(loss).step()``. A multiplier lives in the ``lagrange_multiplier`` buffer of the
+    A rule is one method, :meth:`next_multiplier`. This class checks the costs, projects the
+    multipliers on ``[0, max_multiplier]`` and writes the buffer in place, like
+    ``SoftUpdate(loss).step()``. The multipliers are in the ``lagrange_multiplier`` buffer of the
     loss and nowhere else.
 
     Args:
@@ -38,13 +38,13 @@ class MultiplierUpdater(CostUpdater):
             undiscounted episode cost.
         max_multiplier (float, optional): upper bound of every multiplier. Defaults to no bound.
         pessimism (float, optional): standard errors of the batch's mean episode cost that are
-            added to it. A limit that binds is otherwise met on average only: policies end above
-            it as often as below. Few or uneven episodes are trusted less; a batch of one
-            episode has no standard error, and adds none. Defaults to ``0.0``.
+            added to it. Without it a limit that binds is met on average only: policies end above
+            it as often as below. The margin grows if episodes are few or uneven; a batch of one
+            episode has no standard error and adds none. Defaults to ``0.0``.
         normalize (bool, optional): make the violation relative, with no unit and never more than 1:
             divide it by the standard deviation of the episode costs, or by a fifth of the limit if
             that is larger, and clip it to [-1, 1]. The divisor is the largest of all batches so
-            far, of which each new one forgets a fifth. Then costs and limit times 1,000 move the
+            far; each new batch forgets a fifth of it. Costs and limit times 1,000 then give the
             same multipliers. Needs limits that are not negative. Defaults to ``False``.
         cost_names (sequence of str, optional): names of the k costs in their order, for example
             ``env.cost_names``: those of limits by name, and those that errors and logs use.
@@ -99,8 +99,8 @@ class MultiplierUpdater(CostUpdater):
         violation, cost_scale = self._violation(episode_cost), self.cost_scale
         if self.normalize:
             current, past = self._scale_of(episode_cost), cost_scale.to(episode_cost)
-            # Not of this batch alone: one with few costs would count for more than one with many,
-            # and rare costs would exceed the limit on average.
+            # Not the scale of this batch alone: a batch with few costs would count more than one
+            # with many, and rare costs would exceed the limit on average.
             scale = torch.maximum(current, past)
             violation = torch.where(scale > 0, violation / scale, 0.0).clamp(-1, 1)
             cost_scale = torch.maximum(current, past.lerp(current, _FORGOTTEN))

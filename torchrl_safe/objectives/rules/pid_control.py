@@ -26,25 +26,24 @@ class PIDControl(MultiplierUpdater):
         \lambda &\leftarrow \mathrm{clip}(I + k_p (\bar J - d)
             + k_d (\bar J - \bar J_\mathrm{previous})_+,\ 0,\ \mathrm{max})
 
-    **The defaults have no unit.** A limit that is far away is approached at the same pace whether
-    costs are thousands or thousandths: the multiplier is 1.2 after the first batch and 5 after
-    twenty. It is bounded, since one that has grown while the task was not learnt yet would leave
-    the reward no weight to learn it. This needs advantages without a unit, which the losses have by
-    default (``normalize_cost_advantage``). With ``normalize=False`` the gains are in multiplier per
-    unit of cost, as published, and need tuning.
+    **The defaults have no unit.** Far above the limit the multiplier is 1.2 after the first batch
+    and 5 after twenty, whether costs are thousands or thousandths. It is bounded: without a bound
+    it could grow until the reward has no weight, before the task is learnt. The defaults need
+    advantages without a unit, which the losses have by default (``normalize_cost_advantage``). With
+    ``normalize=False`` the gains are in multiplier per unit of cost, as published, and need tuning.
 
     The integral alone is :class:`~torchrl_safe.objectives.DualAscent` with ``lr = ki``. It lags
-    behind the policy, so that cost and multiplier circle round their optimum: the proportional
-    term damps that, and the derivative term answers a rising cost before the limit is passed (a
-    falling cost is never held up). The integral is kept within the bounds of the multiplier, so
-    that it comes back from either as soon as the violation changes its sign.
+    behind the policy, so cost and multiplier circle round their optimum. The proportional term
+    damps that. The derivative term reacts to a rising cost before the limit is exceeded, and does
+    not react to a falling one. The integral stays within the bounds of the multiplier, so it leaves
+    a bound as soon as the violation changes its sign.
 
-    The multiplier moves with the noise of the batch costs times ``kp`` and ``kd``, and since noise
-    rises too, a steady batch cost of standard deviation s lifts it by about ``0.56 * kd * s``.
-    ``smoothing`` takes most of that away at the price of a delay of about
-    ``1 / (1 - smoothing)`` batches. The authors' code (rlpyt, ``projects/safe``) smooths with
-    0.95, over some 1900 large batches; its derivative over several batches is not in the paper's
-    algorithm and not here.
+    The terms of ``kp`` and ``kd`` pass the noise of the batch costs on to the multiplier. The
+    derivative term only adds, so a constant cost with noise of standard deviation s raises the
+    multiplier by about ``0.56 * kd * s``. ``smoothing`` removes most of that, and delays the rule
+    by about ``1 / (1 - smoothing)`` batches. The authors' code (rlpyt, ``projects/safe``) smooths
+    with 0.95, over some 1900 large batches; its derivative over several batches is not in the
+    paper's algorithm and not here.
 
     The division by :math:`1 + \sum_i \lambda_i` that the paper adds is in
     :func:`~torchrl_safe.objectives.penalized_advantage` and so in the losses, not here.
@@ -70,7 +69,7 @@ class PIDControl(MultiplierUpdater):
     Raises:
         ValueError: if a gain is negative or not finite, or ``smoothing`` is outside ``[0, 1)``.
 
-    A multiplier that is assigned or loaded between two steps moves the integral by as much.
+    If you assign or load a multiplier between two steps, the integral moves by as much.
 
     Examples:
         >>> import torch
@@ -132,7 +131,7 @@ class PIDControl(MultiplierUpdater):
         self.last_multiplier = multiplier.clone()
 
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
-        # The cost, not the violation: a limit that somebody changes is no rise. (A normalized
+        # The cost, not the violation: a new limit is not a rise of the cost. (A normalized
         # violation has no unit in which the limit could be added.)
         limit = self.cost_limit.to(multiplier) * (not self.normalize)
         cost = violation + limit

@@ -14,7 +14,7 @@ class ViolationUpdater(CostUpdater):
     :class:`~torchrl_safe.objectives.IPOLoss`, :class:`~torchrl_safe.objectives.CRPOLoss` and, for
     CPO and PCPO, :class:`~torchrl_safe.objectives.TrustRegionLoss` read, once for each collected
     batch and before the batch is learned from. Until the first
-    episode has ended the buffer is zero: as if every cost stood at its limit.
+    episode has ended the buffer is zero, as if every cost were at its limit.
 
     Args:
         loss_module (LossModule): a loss with a ``cost_violation`` buffer of shape ``(k,)``.

@@ -24,10 +24,10 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
 
     (Schulman et al. 2015, https://arxiv.org/abs/1502.05477, equation 14; Achiam et al. 2017,
     https://arxiv.org/abs/1705.10528, equation 10), and :meth:`cost_surrogate_loss` gives
-    :math:`\mathrm{E}[w A_{c_i}]`. Nothing here bounds the policy's step: a
-    :class:`~torchrl_safe.objectives.TrustRegionStep` moves the actor, an ordinary optimizer the
-    two critics on :meth:`critic_losses`. (TRPO without costs needs no
-    more than :class:`~torchrl.objectives.PPOLoss`.)
+    :math:`\mathrm{E}[w A_{c_i}]`. The loss does not bound the policy's step. A
+    :class:`~torchrl_safe.objectives.TrustRegionStep` moves the actor, and an ordinary optimizer
+    moves the two critics with :meth:`critic_losses`. (TRPO without costs needs only
+    :class:`~torchrl.objectives.PPOLoss`.)
 
     This class is a thin specialization of :class:`~torchrl.objectives.PPOLoss`, whose arguments,
     keys and outputs it keeps; with every multiplier at zero its outputs and gradients are those
@@ -55,7 +55,7 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
             deviation, as :func:`~torchrl_safe.objectives.scaled_advantages` says, so that a
             multiplier has no unit. Defaults to ``True``.
         **kwargs: every keyword argument of :class:`~torchrl.objectives.PPOLoss`. Its
-            ``entropy_bonus`` is on by default and then a part of what the step maximizes.
+            ``entropy_bonus`` is on by default; the step then maximizes it too.
 
     Raises:
         ValueError: if ``num_costs`` or ``multiplier_init`` is not usable; in a call, if the cost

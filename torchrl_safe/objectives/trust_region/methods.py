@@ -1,4 +1,4 @@
-"""What tells the trust-region methods apart: the step they take in the local problem."""
+"""Trust-region methods: the step that each takes in the local problem."""
 
 from __future__ import annotations
 
@@ -30,6 +30,14 @@ class TrustRegionProblem:
         natural_cost_gradient (Tensor): :math:`H^{-1} b`, shape ``(n,)``.
         violation (float): :math:`c`, cost minus limit in the unit of the cost surrogate.
         product (callable): from a vector :math:`x` of shape ``(n,)`` to :math:`H x`.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_safe.objectives import TRPO
+        >>> gradient, zero = torch.tensor([3.0, 4.0]), torch.zeros(2)
+        >>> problem = TrustRegionProblem(gradient, gradient, 0.02, zero, zero, 0.0, lambda x: x)
+        >>> TRPO()(problem).step  # Along the gradient, of length sqrt(2 * 0.02).
+        tensor([0.1200, 0.1600])
     """
 
     gradient: Tensor
@@ -48,7 +56,12 @@ class TrustRegionSolution:
     Args:
         step (Tensor): change of the parameters, shape ``(n,)``.
         constraint_active (bool): whether the cost constraint shaped it.
-        recovery (bool): whether it only lowers the cost, so that no gain is asked of it.
+        recovery (bool): whether it only lowers the cost. It then need not raise the reward.
+
+    Examples:
+        >>> import torch
+        >>> TrustRegionSolution(step=torch.zeros(2)).recovery
+        False
     """
 
     step: Tensor
@@ -59,7 +72,7 @@ class TrustRegionSolution:
 class TrustRegionMethod(abc.ABC):
     """A step rule: a frozen dataclass called with a :class:`TrustRegionProblem`.
 
-    ``constrained`` tells whether it heeds the cost limit; the cost is shown to no other.
+    ``constrained`` says whether the rule uses the cost limit. Only then does it get the cost.
 
     Examples:
         >>> from dataclasses import dataclass
@@ -110,9 +123,9 @@ class CPO(TrustRegionMethod):
     """Constrained policy optimization: the best step that keeps the cost below its limit.
 
     Achiam et al. 2017 (https://arxiv.org/abs/1705.10528); the closed form and its four cases
-    are those of :func:`~torchrl_safe.objectives.trust_region.solver.cpo_weights`. It has one cost:
-    with k of them the dual has 2^k sets of active constraints and no closed form. For more,
-    add up the costs, or use :class:`TRPO` with a multiplier for each.
+    are those of :func:`~torchrl_safe.objectives.trust_region.solver.cpo_weights`. It takes one
+    cost: with k costs the dual has 2^k sets of active constraints and no closed form. For several
+    costs, add them up, or use :class:`TRPO` with a multiplier for each.
 
     Examples:
         >>> import torch
@@ -155,9 +168,9 @@ class PCPO(TrustRegionMethod):
 
     Yang et al. 2020 (https://arxiv.org/abs/2010.03152); see
     :func:`~torchrl_safe.objectives.trust_region.solver.pcpo_weight`. Far above the limit the
-    projection lies outside the trust region; the step then ends at its edge, on the way there (in
-    the paper nothing bounds it). It has one cost, for the reason given at :class:`CPO`: the
-    projection on several half-spaces has no closed form either.
+    projection lies outside the trust region. The step then ends at its edge, on the way there (in
+    the paper nothing bounds it). It takes one cost, because the projection on several half-spaces
+    has no closed form.
 
     Args:
         kl_projection (bool, optional): project to the point of least divergence, in the metric

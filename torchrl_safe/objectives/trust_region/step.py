@@ -72,16 +72,17 @@ class TrustRegionStep:
     (Achiam et al. 2017, https://arxiv.org/abs/1705.10528, section 6.1). If no length will do, or
     the damped Fisher matrix is found not to be positive definite, the parameters stay as they
     were, bit for bit, and ``rejected_steps`` or ``indefinite_steps`` counts it.
-    Exactly at a limit, as before the first episode has ended, no step that raises the cost passes.
+    Exactly at a limit, as before the first episode has ended, a step that raises the cost is
+    rejected.
 
-    The surrogates are means over steps, a limit is one of whole episodes: the loss's
-    ``cost_violation`` is divided by the length of an episode before ``method`` gets it, which is
+    The surrogates are means over steps, a limit is about whole episodes. So the loss's
+    ``cost_violation`` is divided by the length of an episode before ``method`` gets it. This is
     the factor :math:`1 - \gamma` of the paper's equation 10.
 
     Args:
         loss_module (PPOLoss): :class:`~torchrl.objectives.PPOLoss` for TRPO alone, else a
-            :class:`~torchrl_safe.objectives.TrustRegionLoss`. The actor shares no parameter
-            with a critic, or the step moves that too. Of the losses, ``"loss_objective"`` and,
+            :class:`~torchrl_safe.objectives.TrustRegionLoss`. The actor must not share parameters
+            with a critic: the step would move these too. Of the losses, ``"loss_objective"`` and,
             if there is one, ``"loss_entropy"`` are the surrogate. (An entropy estimated from
             samples makes the line search noisy: better ``entropy_bonus=False``.)
         method (TrustRegionMethod, optional): :class:`~torchrl_safe.objectives.CPO`,

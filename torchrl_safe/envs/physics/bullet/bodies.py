@@ -27,7 +27,7 @@ from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.state import Array
 
 _UNLIMITED_EFFORT = 1e5
-# More than the fingers' motors can do, N.
+# More than the force of the fingers' motors, N.
 _GEAR_FORCE = 1e3
 
 
@@ -112,8 +112,8 @@ def load_arm(
 def _couple(client: int, body: int, fingers: Sequence[int]) -> None:
     """Makes the fingers open alike, as the gear of a parallel gripper does.
 
-    Else equal efforts from both sides of what is held cancel, and it slides with both fingers
-    towards either of them as soon as the hand moves.
+    Without it, equal forces from both sides cancel, and as soon as the hand moves, what it holds
+    slides to one side together with both fingers.
     """
     for finger in fingers[1:]:
         gear = pybullet.createConstraint(
@@ -233,7 +233,7 @@ def add_goal(client: int, position: Sequence[float]) -> list[int]:
 
 def _skin(client: int, parts: Sequence[Part], default: Colour) -> int:
     geometries, sizes = zip(*(_geometry(part.shape) for part in parts), strict=True)
-    # Of what a shape has no use for PyBullet wants any value.
+    # PyBullet wants a value also for arguments that this shape does not use.
     return pybullet.createVisualShapeArray(
         shapeTypes=geometries,
         radii=[size.get("radius", 1.0) for size in sizes],

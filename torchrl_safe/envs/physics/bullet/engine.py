@@ -1,6 +1,6 @@
-"""PyBullet where it is installed, and elsewhere what says so as soon as a world is to be made.
+"""PyBullet. If it is not installed, an object that says so when a world is made.
 
-The transforms of this package, other engines and environments of others need none.
+Transforms, the other engine and the wrappers of Gymnasium environments do not need it.
 """
 
 from __future__ import annotations

@@ -15,6 +15,14 @@ class BulletInverseKinematics:
 
     Only for the paper's environment, and with ``physics=Bullet()``: it is slower and less exact
     than :class:`~torchrl_safe.envs.DampedLeastSquares`.
+
+    Examples:
+        >>> from torchrl_safe.envs import ArmEnv, CartesianDelta
+        >>> action = CartesianDelta(inverse_kinematics=BulletInverseKinematics())
+        >>> env = ArmEnv(action=action)
+        >>> env.rollout(2)["action"].shape
+        torch.Size([1, 2, 3])
+        >>> env.close()
     """
 
     def __call__(

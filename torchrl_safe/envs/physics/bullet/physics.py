@@ -17,24 +17,24 @@ from torchrl_safe.envs.state import Sensing
 class Bullet:
     """Physics by PyBullet (the ``arms`` extra): every world is a server of its own.
 
-    The defaults are the cheapest that are right; the others are those of the paper's environment.
+    The defaults are the fastest that are correct. The other values are for the paper's environment.
 
     Args:
         furniture: URDF files of ``pybullet_data`` with their positions. Empty gives a table
             whose top is at height 0.
         target_urdf: body of the target, a file of ``pybullet_data``, free to move; the goal is
-            then read from the simulator. ``None`` makes the target a mere point.
-        merged_links: simulate links that fixed joints hold together as one, with
-            the contact properties of the first link: a physics step takes 15 to 40 % less
-            time. With ``urdf_inertia`` it is the same body; else its inertia is that of another
-            box. Not done where the task moves objects, whose grip depends on these properties.
-        motor_gain: if given, the motors go this share of the way that is left to their targets
-            in each physics substep, fastest at the beginning of a control step; with 1/12 and 12
-            substeps they have gone 65 % of the way at its end. ``None`` moves the targets evenly,
-            see :class:`~torchrl_safe.envs.ActionMode`.
+            then read from the simulator. With ``None`` the target is a point.
+        merged_links: simulate links that fixed joints hold together as one link, with the contact
+            properties of the first: a physics step takes 15 to 40 % less time. With
+            ``urdf_inertia`` it is the same body; otherwise its inertia is that of another box.
+            It has no effect if the task moves objects, whose grip depends on these properties.
+        motor_gain: if given, the motors go this share of the remaining way to their targets in
+            each physics substep. With 1/12 and 12 substeps they have gone 65 % of the way at the
+            end of a control step. ``None`` moves the targets evenly, see
+            :class:`~torchrl_safe.envs.ActionMode`.
         urdf_inertia: take inertias from the URDF instead of from the collision shapes.
         fresh_links: read the tool pose of the current joint angles. ``False`` reads it one
-            physics substep late, as PyBullet does unless told otherwise.
+            physics substep late, as PyBullet does by default.
 
     Raises:
         TypeError: if a flag is not True or False.

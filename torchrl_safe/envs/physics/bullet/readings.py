@@ -1,4 +1,4 @@
-"""Measures in one world what costs ask for; like ``world.py``, of which it is a part."""
+"""Measures in one world what costs ask for. A part of ``world.py``."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Readings:
         furniture: numbers of the bodies that count as the table.
         num_obstacles: number of obstacles, present or not.
         sensing: what is measured.
-        fresh_links: read links where they are now. Reading one so makes Bullet forget where it
-            was one substep ago, which may be wanted.
+        fresh_links: read links where they are now. Bullet then forgets where they were one substep
+            ago.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The targets that the motors have had in the running episodes, which play them again."""
+"""The motors' targets in the running episodes, from which they can be replayed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class TargetRecord:
         targets = np.concatenate([joints, fingers], axis=1)
         count, room, _ = self._targets.shape
         last = int(self.steps.max())
-        if not last:  # A long episode before leaves nothing behind.
+        if not last:  # Free what a long episode has taken.
             self._targets, room = self._targets[:, :0], 0
         if last >= room:
             longer = np.zeros((count, max(32, 2 * last), targets.shape[1]))

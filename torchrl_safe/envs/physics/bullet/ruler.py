@@ -1,4 +1,4 @@
-"""Measures how far the arm is from everything else: with ``world.py``, what talks to PyBullet."""
+"""Measures how far the arm is from everything else. Like ``world.py`` it calls PyBullet."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _PAIRS = 24
 
 
 class Ruler:
-    """A world of its own, in which nothing is simulated: it stands in for all others in turn.
+    """A world in which nothing is simulated, to measure all others in turn.
 
     Args:
         arm: the arm.
@@ -65,12 +65,12 @@ class Ruler:
         if options.furniture:
             table = load_furniture(client, options.furniture, visuals=False)
         else:
-            # As if it had no edges: twice as fast as a box.
+            # A plane without edges: twice as fast as a box.
             plane = pybullet.createCollisionShape(
                 pybullet.GEOM_PLANE, planeNormal=(0, 0, 1), physicsClientId=client
             )
             table = [pybullet.createMultiBody(0, plane, physicsClientId=client)]
-        # Put in its place from outside, whether it has a mass or not.
+        # Placed from outside, with or without a mass.
         self._obstacles = [
             add_shape(client, replace(shape, mass=0.0), (0, 0, -100), None) for shape in shapes
         ]
@@ -90,7 +90,7 @@ class Ruler:
         self._other = np.repeat([index for *_, index in self._things], _PAIRS)
 
     def _is_level(self, link: int) -> bool:
-        """Whether a link turns about vertical axes only: nothing of it rises or sinks."""
+        """Whether a link turns about vertical axes only, so that it never rises or sinks."""
         _, axes = self._frames([0.0] * len(self._driven))
         moved = self._moves[link]
         return bool((~self._slides[moved]).all() and (np.abs(axes[moved, 2]) > 1 - 1e-9).all())

@@ -31,9 +31,9 @@ Parts = Mapping[str, tuple[slice, tuple[int, ...]]]
 class BulletSimulator:
     """N worlds of the same build, see :class:`~torchrl_safe.envs.physics.simulator.Simulator`.
 
-    PyBullet cannot save a world: what it saves lacks motor targets and contacts. But a reset is
-    the same whatever came before it. So episodes come back bit for bit from the targets that the
-    motors have had since.
+    PyBullet cannot save a world completely: motor targets and contacts are missing. But a reset
+    does not depend on what came before it, so replaying the motors' targets since the reset brings
+    an episode back, bit for bit.
 
     Args:
         options: how the worlds are simulated.

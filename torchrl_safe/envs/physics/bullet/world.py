@@ -1,4 +1,4 @@
-"""One simulated world. With ``bodies.py`` and ``readings.py`` all that talks to PyBullet."""
+"""One simulated world. This file, ``bodies.py`` and ``readings.py`` call PyBullet."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class World:
         gui: bool = False,
     ) -> None:
         if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-            # PyBullet would end the process, and with it all that was learnt.
+            # PyBullet would end the process, and the training with it.
             raise RuntimeError("gui needs a screen, but DISPLAY is not set: make a video instead.")
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self._client < 0:
@@ -79,7 +79,7 @@ class World:
         # PyBullet reuses client numbers: each is disconnected once, by its owner.
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
         self._scene, self._options = scene, options
-        # Where joints and fingers are, if nothing has moved since that was last read.
+        # Joints and fingers as last read, as long as nothing has moved.
         self._positions: Vector | None = None
         try:
             self._build(arm, shapes, objects, sensing, visuals=visuals or gui)
@@ -248,7 +248,7 @@ class World:
         """
         client, arm = self._client, self._arm.body
         targets = [*joint_target, *finger_target]
-        # What efforts did not allow in the first half is made good in the second.
+        # The second half makes up for what efforts did not allow in the first.
         halfway = None if self._options.motor_gain else substeps // 2 + 1
         distances = [math.inf] * len(self._obstacles)
         forces = [0.0] * len(self._obstacles)
@@ -493,7 +493,7 @@ class World:
         return pybullet.getBaseVelocity(body, physicsClientId=self._client)
 
     def _is_simulated(self, index: int) -> bool:
-        # What is not present falls for ever, which nobody wants to know.
+        # What is not present falls for ever: do not report that.
         return not self._is_fixed[index] and index in self._present
 
     def _obstacle_pose(self, index: int) -> tuple[Vector, Vector]:
@@ -509,5 +509,5 @@ _BODY_PARTS = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity
 
 
 def _limbo(index: int) -> tuple[float, float, float]:
-    """Out of the world, and out of the way of whatever else is there."""
+    """Out of the world, at a place where nothing else is."""
     return (10.0 * index, 0.0, -100.0)

@@ -36,14 +36,14 @@ def thing(index: int) -> str:
 
 
 def add_table(spec: Any, *, reach: float) -> None:
-    """Adds the table: a box, for what falls off it is to fall on."""
+    """Adds the table: a box, so that what falls off its edge keeps falling."""
     _add_geom(
         spec.worldbody, TABLE, _TABLE, TABLE_COLOUR, free=False, reach=reach, pos=_TABLE_PLACE
     )
 
 
 def add_obstacle(spec: Any, index: int, shape: Shape, *, reach: float) -> None:
-    """Adds an obstacle: put in its place from outside, unless it has a mass.
+    """Adds an obstacle. It is placed from outside, unless it has a mass.
 
     Args:
         spec: the world; changed in place.

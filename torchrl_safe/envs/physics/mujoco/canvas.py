@@ -17,8 +17,8 @@ _SCREENLESS = ("mujoco.egl", "mujoco.osmesa")
 def make_canvas(width: int, height: int) -> Any:
     """Returns an OpenGL context, current: MuJoCo's own choice, or without a screen what there is.
 
-    MuJoCo chooses when it is imported, which others may have done before, and takes a screen for
-    granted.
+    MuJoCo chooses when it is imported, which may have happened before, and assumes that there is a
+    screen.
 
     Raises:
         RuntimeError: if there is none.
@@ -29,7 +29,7 @@ def make_canvas(width: int, height: int) -> Any:
         try:
             canvas = import_module(module).GLContext(width, height)
             canvas.make_current()
-        except Exception as error:  # Each has its own ways to fail.
+        except Exception as error:  # Each fails with other errors.
             failures.append(f"{module}: {error}")
         else:
             return canvas

@@ -16,7 +16,7 @@ _ARM, _FIXED, _FREE = 1, 2, 4
 #: Friction of everything whose URDF gives none. PyBullet multiplies those of the two that touch;
 #: MuJoCo takes the larger, or that of the shape with the higher priority: here the product.
 _FRICTION = 0.5
-# Against turning on the spot and rolling, m: of a fingertip, and next to none.
+# Friction against turning on the spot and rolling, m: that of a fingertip, and almost none.
 _SPIN, _ROLL = 0.005, 1e-4
 #: As stiff as the step allows, and without bouncing: time constant, s, and damping ratio.
 STIFF = (2 * SUBSTEP, 1.0)
@@ -34,7 +34,7 @@ def set_options(spec: Any, gravity: float) -> None:
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 10
-    # A state that has gone wrong is to be seen, not to be replaced by another.
+    # Show a state that has gone wrong instead of replacing it.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
 
 
@@ -82,7 +82,7 @@ def _set(geom: Any, kind: int, others: int) -> None:
 
 
 def measure_base(spec: Any, moving: str, obstacles: Sequence[str], *, reach: float) -> None:
-    """Finds how near obstacles are to what does not move of the arm, which else nobody tests.
+    """Measures obstacles against the fixed part of the arm, which MuJoCo does not test by itself.
 
     Args:
         spec: the world; changed in place.
@@ -97,16 +97,16 @@ def measure_base(spec: Any, moving: str, obstacles: Sequence[str], *, reach: flo
                 continue
             geom.name = geom.name or f"{base.name}/{number}"
             for name in obstacles:
-                # With forces from a depth on that there is not.
+                # Forces begin at a depth that never occurs.
                 spec.add_pair(geomname1=geom.name, geomname2=name, margin=-1, gap=1 + reach)
         base = base.parent
 
 
 def exclude_overlaps(spec: Any, arm: set[str], model: Any, data: Any) -> None:
-    """Keeps those links from colliding that touch each other at home, and neighbours.
+    """Excludes collisions of neighbouring links, and of links that touch each other at home.
 
-    The collision shapes of neighbours overlap, which is not the arm's doing. MuJoCo does not test
-    parents against children, unless the parent does not move.
+    The collision shapes of neighbours overlap by design. MuJoCo does not test parents against
+    children, unless the parent does not move.
 
     Args:
         spec: the world; changed in place.
@@ -126,11 +126,11 @@ def exclude_overlaps(spec: Any, arm: set[str], model: Any, data: Any) -> None:
 
 
 def exclude_unreachable(spec: Any, arm: set[str], model: Any, data: Any, *, reach: float) -> None:
-    """Keeps those links from being tested against the table that cannot get near it.
+    """Excludes tests of links against the table that cannot get near it.
 
-    It changes nothing but the time: the table is so large that its bounding sphere holds the arm,
-    and a test of two shapes takes longest near the base, where a Panda's first two links can never
-    touch anything.
+    It saves time and changes nothing else. The bounding sphere of the table contains the arm, and
+    the slowest tests are those near the base, where a Panda's first two links can never touch
+    anything.
 
     Args:
         spec: the world; changed in place.
@@ -153,7 +153,7 @@ def exclude_unreachable(spec: Any, arm: set[str], model: Any, data: Any, *, reac
 
 
 def level_bodies(model: Any, data: Any) -> set[int]:
-    """Returns the bodies that turn about vertical axes, if at all: nothing of them rises or sinks.
+    """Returns the bodies that never rise or sink: at most they turn about vertical axes.
 
     Args:
         model: the world, compiled.

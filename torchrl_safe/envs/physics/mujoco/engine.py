@@ -1,4 +1,4 @@
-"""MuJoCo where it is installed, and elsewhere what says so as soon as a world is to be made."""
+"""MuJoCo. If it is not installed, an object that says so when a world is made."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["batch", "mujoco", "quiet"]
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keeps MuJoCo from writing a file of what goes wrong, which is raised as an error."""
+    """Keeps MuJoCo from writing warnings to a file: they are raised as errors."""
     before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
     silent.logto_file = silent.logto_console = False
     silent.set()

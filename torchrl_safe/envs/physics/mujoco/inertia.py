@@ -1,8 +1,8 @@
 """Inertias of the boxes around collision shapes.
 
-The inertias in the URDF files of some arms are placeholders: a Panda's wrist would be seventy times
-as heavy to turn as it is, and no motor of it could do what an action asks for. PyBullet does the
-same by default, so that both engines simulate the same arm.
+The inertias in the URDF files of some arms are placeholders. A Panda's wrist would be seventy times
+as heavy to turn as the real one, and its motor could not do what an action asks for. PyBullet takes
+the same boxes by default, so both engines simulate the same arm.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Mesh files in words that MuJoCo understands."""
+"""Mesh files in a form that MuJoCo reads."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _OBJECT = ("o", "g")
 def read_meshes(root: Element) -> dict[str, bytes]:
     """Returns the Wavefront files of a URDF by the names that the URDF has for them afterwards.
 
-    Of several objects in a file MuJoCo reads the first, while PyBullet makes a convex hull of each:
-    so does MuJoCo, if each is a shape of its own. COLLADA files, which MuJoCo cannot read, are left
-    out: of links that have nothing else to show, the shapes that collide are drawn.
+    PyBullet makes a convex hull of each object in a file, MuJoCo reads only the first. So each
+    object becomes a shape of its own. COLLADA files, which MuJoCo cannot read, are left out. If a
+    link has nothing else to show, its collision shapes are drawn.
 
     Args:
         root: a URDF with the paths of its meshes; changed in place.
@@ -50,7 +50,7 @@ def read_meshes(root: Element) -> dict[str, bytes]:
 def _objects(text: str) -> list[bytes]:
     """The objects of a Wavefront file, each with its corners and faces only.
 
-    Environments are made again and again with one arm; to read its meshes took a quarter of that.
+    Cached, because reading the meshes took a quarter of the time to make an environment.
     """
     corners: list[str] = []
     objects: list[list[list[int]]] = [[]]

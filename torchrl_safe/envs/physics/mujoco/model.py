@@ -117,7 +117,7 @@ def build_scenery(
 ) -> Any:
     """Builds what is to be seen of a world: an ``MjModel`` with the same joints.
 
-    Of what is put in its places from outside, the goal is the last.
+    The goal is the last of the bodies that are placed from outside.
     """
     spec, _ = _read_arm(arm, scene, objects, visuals=True)
     dress_arm(spec)
@@ -138,7 +138,7 @@ def _read_arm(
     return read_arm(
         arm,
         fix_fingers=not scene.free_fingers,
-        # What touches objects has friction of its own, link by link.
+        # Links that touch objects have friction of their own.
         merge=not objects,
         couple=scene.motor_limits,
         visuals=visuals,

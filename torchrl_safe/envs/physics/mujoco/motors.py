@@ -13,19 +13,18 @@ from torchrl_safe.envs.physics.scene import SUBSTEP
 from torchrl_safe.envs.state import Array
 
 # How fast the motors of the joints correct, rad/s. Their damping then stops a joint within one
-# substep; with more, motors at the end of their efforts, which MuJoCo does not treat implicitly,
-# would chatter.
+# substep. With a higher value, motors at the limit of their efforts would chatter, since MuJoCo
+# does not integrate that limit implicitly.
 _RATE = 0.5 / SUBSTEP
-# What the rotors of geared motors add to what a joint turns at home. Without it, joints with nearly
-# the same axis, such as the first and third of a stretched arm, make each other swing as soon as
-# both are at the end of their efforts: against each other they have next to no inertia.
+# What the rotors of geared motors add to the inertia of a joint at home. Without it, joints with
+# nearly the same axis, such as the first and third of a stretched arm, have almost no inertia
+# against each other, and swing as soon as both are at the limit of their efforts.
 _ROTORS = 0.5
-# Light joints such as those of a wrist have at least as much as takes the motor's full effort so
-# many seconds to bring to its full speed. Else a motor that is told to be off by little would throw
-# its joint about, and one that is told to be off by much would be thrown by those before it: the
-# gains are in proportion.
+# Light joints, such as a wrist's, get at least the inertia that full effort brings to full speed in
+# this time, s. Gains are in proportion to it. With less, a small error would throw the joint about,
+# or the joints before it would.
 _RUN_UP = 4 * SUBSTEP
-# Fingers press with all their effort what keeps them this far from where they are to be, m.
+# Fingers press with all their effort if they are kept this far from their target, m.
 _SQUEEZE = 0.005
 # The effort of fingers that have no limit, N.
 _FINGER_EFFORT = 20.0
@@ -85,9 +84,9 @@ def add_rotors(spec: Any, parts: ArmParts, mass: Array) -> Array:
 def set_gains(model: Any, parts: ArmParts, mass: Array, *, limited: bool) -> None:
     """Makes the servos of each joint critically damped for what it has to move at home.
 
-    The velocity servo brakes; the position servo, which is told to lead, drives. What bounds the
-    force of the latter bounds the speed: a joint goes no faster than where both are in balance,
-    however far behind its target it has fallen.
+    The velocity servo brakes, and the position servo, whose target leads, drives. The bound on the
+    force of the position servo also bounds the speed: a joint goes no faster than where both are in
+    balance, however far it is behind its target.
 
     Args:
         model: the compiled world; changed in place.
@@ -112,9 +111,9 @@ def set_gains(model: Any, parts: ArmParts, mass: Array, *, limited: bool) -> Non
 def fill_controls(controls: Array, current: Array, targets: Array) -> None:
     """Writes the controls of a control step: targets that move evenly over the substeps.
 
-    With 12 substeps the joints then do what is asked for to within one percent, where efforts
-    allow. They lag by two substeps: of a control step of six they do 0.96, of a single one about
-    0.6, and the rest in the next.
+    With 12 substeps the joints do what is asked for to within one percent, if efforts allow. They
+    lag by two substeps: in a control step of six substeps they do 0.96 of it, in one of a single
+    substep about 0.6, and the rest in the next.
 
     Args:
         controls: what is written, ``(N, s, 2 k)``: the first half; the other stays 0.

@@ -22,8 +22,8 @@ class MuJoCo:
 
     Args:
         threads: threads that the worlds are shared between. ``None`` takes a thread for each core
-            that this process may use, and a single one in a worker process, beside which there are
-            others. The results are the same, bit for bit, whatever the number.
+            that this process may use, and a single one in a worker process. The results
+            do not depend on the number, bit for bit.
 
     Raises:
         ValueError: if ``threads`` is not a whole number of at least 1.

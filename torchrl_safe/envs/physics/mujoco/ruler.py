@@ -59,7 +59,7 @@ class Ruler:
             itself=False,
         )
         spec.option.ccd_tolerance = _EXACT
-        # Nothing here pushes anything.
+        # Nothing exerts forces here.
         idle = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         spec.option.disableflags |= int(idle)
         solid = [
@@ -71,13 +71,14 @@ class Ruler:
         for number, geom in enumerate(solid):
             geom.name = f"arm/{number}"
         names = [geom.name for geom in solid]
-        # As if it had no edges: several times as fast as a box.
+        # A plane without edges: several times as fast as a box.
         spec.worldbody.add_geom(name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
         for index, shape in enumerate(shapes):
-            # Put in its place from outside, whether it has a mass or not.
+            # Placed from outside, with or without a mass.
             add_obstacle(spec, index, replace(shape, mass=0.0), reach=0.0)
         for geom in spec.geoms:
-            # Nobody meets anybody; with neither, MuJoCo takes a shape for a mere picture.
+            # No two shapes collide. With both 0, MuJoCo would take a shape for one that is only
+            # drawn.
             geom.contype, geom.conaffinity = 1, 0
         model = spec.compile()
         joints = [model.joint(name).id for name in parts.joints + parts.fingers]
@@ -87,7 +88,7 @@ class Ruler:
         level = level_bodies(model, data)
         body = {name: int(model.geom(name).bodyid[0]) for name in names}
         things = [*(obstacle(index) for index in range(len(shapes))), TABLE]
-        # What no joint moves is not the arm's doing, nor is the height of what turns level.
+        # Leave out what no joint moves, and the table for what only turns about vertical axes.
         pairs = [
             (name, thing)
             for thing in things

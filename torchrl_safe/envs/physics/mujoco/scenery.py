@@ -1,4 +1,4 @@
-"""What is only there to be looked at."""
+"""What is drawn and not simulated."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
 class MuJoCoSimulator:
     """N worlds of the same build, see :class:`~torchrl_safe.envs.physics.simulator.Simulator`.
 
-    A world is a row of numbers: to reset one is to write its row, and what is saved is the table.
+    A world is a row of numbers. A reset writes its row, and a checkpoint holds the table of all.
 
     Args:
         arm: the arm.
@@ -108,9 +108,9 @@ class MuJoCoSimulator:
         self._contact_distance = np.full((num_envs, len(shapes)), np.inf)
         self._contact_force = np.zeros((num_envs, len(shapes)))
         self._senses = sensing != Sensing()
-        # What depends on where everything is after a substep needs one more look after the last.
+        # Measurements of positions after the last substep need one more evaluation.
         self._looks = bool(sensing.clearance or sensing.tool or sensing.links)
-        # Writing down takes time as well.
+        # Recording takes time as well.
         self._recorded: tuple[str, ...] = ("sensordata",)
         if sensing.joints or (sensing.clearance and self._some_free):
             self._recorded += ("qpos", "qvel")

@@ -1,4 +1,4 @@
-"""Where the obstacles of all worlds are that are put in their places from outside."""
+"""Where the obstacles that are placed from outside are, in all worlds."""
 
 from __future__ import annotations
 
@@ -56,7 +56,8 @@ class Tracks:
 
     def seek(self, row: int, elapsed: int) -> None:
         """Puts the obstacles of one world where they are some substeps after its reset."""
-        # As they are found there by who goes on: at the end of a stretch, not at a beginning.
+        # At the end of a stretch, as in a run that was not interrupted, not at the beginning of
+        # one.
         self._begin[row] = max(0, elapsed - 1) // self._ahead * self._ahead
         self._gone[row] = elapsed - self._begin[row]
         ways = self._look(row, self._ahead if self.moving else 1)
