@@ -220,8 +220,7 @@ class ArmEnv(EnvBase):
     def _make_specs(self) -> None:
         for row in range(self.num_envs):
             self._reset_world(row, np.random.default_rng(0))
-        # With the state before it, and without.
-        self._state = self._alone = state = self._read_state()
+        self._state = state = self._read_state()
         # Checks once what the arguments compute, so that errors show when the environment is made.
         joints = state.joint_position.shape[1]
         width = self.action_mode.width(joints)
@@ -283,7 +282,7 @@ class ArmEnv(EnvBase):
         for row in rows:
             self._reset_world(int(row), self._generators[int(row)])
         self._begun = True
-        self._state = self._alone = self._read_state()
+        self._state = self._read_state()
         return self._pack(
             observation=self._observe(self._state),
             success=np.zeros((self.num_envs, 1), dtype=bool),
@@ -301,8 +300,8 @@ class ArmEnv(EnvBase):
         if self.shield is not None:
             joints, fingers = self._shielded(self.shield, joints, fingers)
         self._simulator.advance(joints, fingers)
-        before, self._alone = self._alone, self._read_state()
-        self._state = state = replace(self._alone, previous=before)
+        before = replace(self._state, previous=None)
+        self._state = state = replace(self._read_state(), previous=before)
         reward, cost, success = self._outcome(state)
         truncated = (state.step >= self.max_episode_steps)[:, None] & ~success
         return self._pack(
@@ -373,7 +372,7 @@ class ArmEnv(EnvBase):
         if self.shield is not None:
             for name, array in self._shield_state().items():
                 array[:] = arrays[name]
-        self._state = self._alone = self._read_state()
+        self._state = self._read_state()
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -121,14 +120,12 @@ def fill_controls(controls: Array, current: Array, targets: Array) -> None:
         targets: where they are to be after the last substep, ``(N, k)``.
     """
     substeps, count = controls.shape[1], current.shape[1]
-    parts = np.zeros((len(current), 2, 2 * count))
-    parts[:, 0, :count], parts[:, 1, :count] = targets - current, current
-    np.matmul(_shares(substeps), parts, out=controls)
-
-
-@cache
-def _shares(substeps: int) -> Array:
-    """Shares of what each substep adds, and of what it begins from, ``(s, 2)``."""
+    change = targets - current
     # Ahead by as much as makes good for the braking at the speed of the target.
     lead = 2 / (_RATE * substeps * SUBSTEP)
-    return np.stack([np.arange(1, substeps + 1) / substeps + lead, np.ones(substeps)], axis=1)
+    # Shares of what each substep adds, and of what it begins from.
+    shares = np.ones((substeps, 2))
+    shares[:, 0] = np.arange(1, substeps + 1) / substeps + lead
+    parts = np.zeros((len(current), 2, 2 * count))
+    parts[:, 0, :count], parts[:, 1, :count] = change, current
+    np.matmul(shares, parts, out=controls)

@@ -137,13 +137,11 @@ def touches(data: Array) -> tuple[Array, Array]:
     """
     worlds, _, obstacles, slots, _ = data.shape
     distance, force = np.full((worlds, obstacles), np.inf), np.zeros((worlds, obstacles))
-    # What has found nothing reads zero.
-    row, substep, index = data[..., 0, _FOUND].nonzero()
+    # The nearest come first. What has found nothing reads zero.
+    near = (data[..., 0, _FOUND] > 0) & (data[..., 0, _DIST] <= CONTACT_RANGE)
+    row, substep, index = near.nonzero()
     if len(row):
         hits = data[row, substep, index]
-        # The nearest come first.
-        near = hits[:, 0, _DIST] <= CONTACT_RANGE
-        hits, row, index = hits[near], row[near], index[near]
         used = np.arange(slots) < hits[:, :1, _FOUND]
         np.minimum.at(distance, (row, index), hits[:, 0, _DIST])
         forces = np.where(used, hits[:, :, _NORMAL_FORCE], 0).sum(axis=1)
