@@ -33,13 +33,13 @@ def test_two_costs_and_their_multipliers(tmp_path, capsys):
     )
     assert last["frames"] == 480
     assert last["replaced"] == 0
-    # No step of 40 is as fast as that; the other limit is exceeded as soon as there is a contact.
+    # No step of 40 is as fast as that; any contact exceeds the other limit.
     assert last["multiplier/speed"] == 0
     (file,) = tmp_path.rglob("multiplier/collision.csv")
     with file.open() as rows:
         multipliers = [float(row[1]) for row in csv.reader(rows)]
     assert len(multipliers) == 3
-    assert multipliers == sorted(multipliers)
+    assert min(multipliers[1:]) > 0
     assert multipliers[-1] == pytest.approx(last["multiplier/collision"])
     file = tmp_path / "ppo-lagrangian" / "policy.pt"
     assert load_policy(file).settings["cost_limits"] == [0.0, 40.0]
