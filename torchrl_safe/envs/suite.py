@@ -125,6 +125,10 @@ _BESIDE_A_PERSON: dict[str, Cost] = {
 _BUSY_PERSON = Human(shoulder=(1.2, 0.25, 0.4), rest=(1.0, 0.3, 0.2), pause=(0.05, 0.3))
 # Far enough away that there is room to step back from the hand, and time to push.
 _PERSON_OPPOSITE = Human(shoulder=(1.25, 0.3, 0.4), rest=(1.0, 0.35, 0.2))
+# Between object and goal: all over the table they are in the way of every tenth episode only.
+_IN_THE_WAY = Scattered(
+    count=3, fewest=1, region=Region((0.42, -0.2, 0), (0.64, 0.2, 0)), clearance=0.1
+)
 
 
 def _handling(arm: ArmModel, finger_step: float | None = None) -> CartesianDelta:
@@ -177,7 +181,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM6),
             max_episode_steps=200,
-            frames=131_072,
+            frames=262_144,
         ),
         SuiteTask(
             "panda-push-human",
@@ -188,18 +192,18 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5, "separation": 2.0},
             _handling(PANDA),
             max_episode_steps=200,
-            frames=131_072,
+            frames=262_144,
         ),
         SuiteTask(
             "panda-pick-in-front",
             PANDA,
             PickAndPlace(),
-            InFront(),
+            InFront(gap=0.12),
             _ONE_TOUCH,
             {"collision": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
-            frames=131_072,
+            frames=262_144,
         ),
         SuiteTask(
             "ur10-pick-workspace",
@@ -213,18 +217,18 @@ SUITE: dict[str, SuiteTask] = {
             {"workspace": 0.5, "contact-force": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
-            frames=131_072,
+            frames=262_144,
         ),
         SuiteTask(
             "xarm7-pick-scattered",
             XARM7,
             PickAndPlace(),
-            Scattered(count=3, fewest=1),
+            _IN_THE_WAY,
             _ONE_TOUCH,
             {"collision": 0.5},
             _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
-            frames=131_072,
+            frames=262_144,
         ),
     )
 }
