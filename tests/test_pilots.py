@@ -89,17 +89,21 @@ def test_the_limits_of_the_suite_can_be_kept(make_env, name):
     assert (cost.mean(0) <= [*task.cost_limits.values()]).all(), cost.mean(0)
 
 
-@pytest.mark.parametrize("name", ["panda-push-human", "panda-pick-in-front"])
-def test_who_is_in_a_hurry_does_the_task_and_costs_more(make_env, name):
-    task, costs = SUITE[name], []
-    for care in (CAREFUL, HURRIED):
-        env = make_env(task.make_env, num_envs=48, physics=MuJoCo(threads=1), seed=10)
-        success, cost = fly(env, care=care)
-        assert success.mean() >= 0.95
-        costs.append(cost.mean(0))
-    careful, hurried = costs
-    assert (hurried >= careful).all()
-    assert (hurried > careful + 0.5 * np.array([*task.cost_limits.values()])).any()
+@pytest.mark.parametrize(
+    ("name", "violated"),
+    [
+        ("panda-push-human", "separation"),
+        ("panda-pick-in-front", "clearance"),
+        ("ur10-pick-workspace", "clearance"),
+    ],
+)
+def test_who_is_in_a_hurry_does_the_task_and_violates_a_limit(make_env, name, violated):
+    task = SUITE[name]
+    env = make_env(task.make_env, num_envs=24, physics=MuJoCo(threads=1), seed=10)
+    success, cost = fly(env, care=HURRIED)
+    assert success.mean() >= 0.95
+    costs = dict(zip(env.cost_names, cost.mean(0), strict=True))
+    assert costs[violated] >= 3 * task.cost_limits[violated]
 
 
 @pytest.mark.parametrize("task", ["push", "pick"])

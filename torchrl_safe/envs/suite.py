@@ -1,6 +1,6 @@
 """Ten tasks, each with costs and a limit for each of them: the benchmark of this library, as data.
 
-Every arm, task, layout of obstacles and kind of action is in one of them, and five have two or
+Every arm, task, layout of obstacles and kind of action is in one of them, and four have two or
 more limits.
 """
 
@@ -116,6 +116,9 @@ class SuiteTask:
 
 
 _ONE_TOUCH: dict[str, Cost] = {"collision": Collision()}
+# Who carries a cube against an obstacle is stopped by it, and soon learns not to, limit or not. To
+# pass closely is a short way and costs nothing but this.
+_CLEARANCE = Collision(margin=0.02)
 _BESIDE_A_PERSON: dict[str, Cost] = {
     "collision": Collision(),
     "separation": SpeedAndSeparation(),
@@ -199,8 +202,8 @@ SUITE: dict[str, SuiteTask] = {
             PANDA,
             PickAndPlace(),
             InFront(gap=0.12),
-            _ONE_TOUCH,
-            {"collision": 0.5},
+            {"clearance": _CLEARANCE},
+            {"clearance": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
             frames=262_144,
@@ -213,8 +216,9 @@ SUITE: dict[str, SuiteTask] = {
             {
                 "workspace": Workspace(Region((0.2, -0.35, 0.0), (0.8, 0.35, 0.45))),
                 "contact-force": ContactForce(),
+                "clearance": _CLEARANCE,
             },
-            {"workspace": 0.5, "contact-force": 0.5},
+            {"workspace": 0.5, "contact-force": 0.5, "clearance": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
             frames=262_144,
