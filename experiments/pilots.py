@@ -46,7 +46,7 @@ class Care:
     Args:
         over: how far above obstacles the tool goes over them, m.
         slope: how steeply it comes down to a place, m up for each m sideways.
-        aside: how far from the goal an object is put, on the side away from the nearest obstacle, m.
+        aside: how far from the goal an object is put, away from the nearest obstacle, m.
         narrower: how much narrower the way round an obstacle is on which an object is pushed, m
             along x, where the hand is wide, and y.
         room: how far off what moves is to be, or the tool goes back, m.
