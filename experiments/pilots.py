@@ -123,8 +123,8 @@ class PickAndPlacePilot:
         pick = _from_above(tool, low, top, self.care)
         put = _from_above(tool, goal, np.maximum(top, goal[:, 2]), self.care)
         # Who rests on an obstacle gets off it towards the goal: pressing on, it would stay.
-        touches = (state.contact_distance <= 0).any(axis=1)
-        put = np.where(touches[:, None], _off(tool, _beside_goal(state, CAREFUL.aside)), put)
+        touches = (state.contact_distance <= 0).any(axis=1, keepdims=True)
+        put = np.where(touches, _off(tool, _beside_goal(state, CAREFUL.aside)), put)
         target = np.where(held[:, None], put, pick)
         return target, np.where(held | near, 0.0, 1.0)
 
@@ -293,7 +293,7 @@ def _away(place: Array, state: ArmState) -> Array:
     off = (place[:, None] - state.obstacle_position) * (1, 1, 0)
     distance = np.where(state.obstacle_present, _length(off), np.inf)
     away = _unit(off[np.arange(len(off)), distance.argmin(1)])
-    return np.where(state.obstacle_present.any(1)[:, None], away, 0)
+    return np.where(state.obstacle_present.any(1, keepdims=True), away, 0)
 
 
 def _off(tool: Array, place: Array) -> Array:
