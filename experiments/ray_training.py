@@ -37,7 +37,6 @@ from experiments.config import Config as TrainConfig
 from experiments.files import is_new
 from experiments.log import Log, figures
 from torchrl_safe.envs import ArmEnv, Collision, Speed
-from torchrl_safe.objectives import PIDControl
 from torchrl_safe.policy import save_policy
 
 COSTS: dict[str, Any] = {"collision": Collision(), "speed": Speed(limit=1.0)}
@@ -172,8 +171,9 @@ def main(config: Config) -> dict[str, Any]:
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
+    collision, speed = config.cost_limits
     settings = TrainConfig(
-        cost_limit=config.cost_limits[0],
+        costs={"collision": collision, "speed": speed},
         frames=config.frames,
         frames_per_batch=config.frames_per_batch,
         seed=config.seed,
@@ -183,7 +183,8 @@ def main(config: Config) -> dict[str, Any]:
     env = make_env(num_envs=8)
     training = ALGORITHMS["ppo-lagrangian"].build(env, settings)
     env.close()
-    updater = PIDControl(training.loss, cost_limit=torch.tensor(config.cost_limits))
+    updater = training.updater
+    assert updater is not None  # The rule that moves the multipliers.
     log = Log("csv", config.out / "logs", "ppo-lagrangian")
     log.open()
     batches = math.ceil(config.frames / config.frames_per_batch)

@@ -48,7 +48,6 @@ def shield_table(runs: Sequence[Run]) -> str:
         mine = _select(runs, task, algorithm)
         if "cost/collision" not in mine[0]["evaluation"]:
             continue
-        summed = [run["history"][-1]["summed/collision"] for run in mine]
         figures = [_mean_of(mine, "evaluation", name) for name in ("success", "return")]
         without = ["", ""]
         if "without_shield" in mine[0]:
@@ -57,14 +56,10 @@ def shield_table(runs: Sequence[Run]) -> str:
             )
             without = [f"{success:.1%}", f"{cost:.2f}"]
         lines.append(
-            f"| {task} | {algorithm} | {len(mine)} | {np.mean(summed):,.0f} | {figures[0]:.1%} "
-            f"| {figures[1]:.2f} | {without[0]} | {without[1]} |"
+            f"| {task} | {algorithm} | {len(mine)} | {_summed(mine, 'collision'):,.0f} "
+            f"| {figures[0]:.1%} | {figures[1]:.2f} | {without[0]} | {without[1]} |"
         )
     return "\n".join(lines)
-
-
-def _mean_of(runs: Sequence[Run], part: str, name: str) -> float:
-    return float(np.mean([run[part][name][0] for run in runs]))
 
 
 def table(runs: Sequence[Run], limits: Limits) -> str:
@@ -80,11 +75,10 @@ def table(runs: Sequence[Run], limits: Limits) -> str:
         head = f"| {task} | {algorithm} | {np.mean(success):.1%} | {min(success):.1%} "
         for name, limit in limits[task].items():
             costs = [run["evaluation"][f"cost/{name}"][0] for run in mine]
-            summed = np.mean([run["history"][-1][f"summed/{name}"] for run in mine])
             within = sum(cost <= limit for cost in costs)
             lines.append(
                 f"{head}| {name} | {limit:g} | {np.mean(costs):.2f} | {max(costs):.2f} "
-                f"| {within}/{len(mine)} | {summed:,.0f} |"
+                f"| {within}/{len(mine)} | {_summed(mine, name):,.0f} |"
             )
             head = "| | | | "
     return "\n".join(lines)
@@ -105,7 +99,7 @@ def whole(runs: Sequence[Run], limits: Limits) -> str:
         # The violation of a task is that of its mean over seeds.
         thrice = sum(
             any(
-                _mean_cost(_select(runs, task, algorithm), name) >= 3 * limit
+                _mean_of(_select(runs, task, algorithm), "evaluation", f"cost/{name}") >= 3 * limit
                 for name, limit in limits[task].items()
             )
             for task in _tasks(runs)
@@ -128,13 +122,13 @@ def scores(
     """Success and largest cost in units of the limits, each of shape (tasks, seeds)."""
     success, excess = [], []
     for task in _tasks(runs):
-        mine = _select(runs, task, algorithm)
-        success.append([run["evaluation"]["success"][0] for run in mine])
+        figures = [run["evaluation"] for run in _select(runs, task, algorithm)]
+        of_task = limits[task].items()
+        success.append([figure["success"][0] for figure in figures])
         excess.append(
             [
-                max(run["evaluation"][f"cost/{name}"][0] / limit for name, limit in of_task)
-                for run in mine
-                for of_task in [limits[task].items()]
+                max(figure[f"cost/{name}"][0] / limit for name, limit in of_task)
+                for figure in figures
             ]
         )
     return torch.tensor(success, dtype=torch.float64), torch.tensor(excess, dtype=torch.float64)
@@ -242,19 +236,20 @@ def _select(runs: Sequence[Run], task: str, algorithm: str) -> list[Run]:
     return [run for run in runs if (run["task"], run["algorithm"]) == (task, algorithm)]
 
 
-def _mean_cost(runs: Sequence[Run], name: str) -> float:
-    return float(np.mean([run["evaluation"][f"cost/{name}"][0] for run in runs]))
+def _mean_of(runs: Sequence[Run], part: str, name: str) -> float:
+    return float(np.mean([run[part][name][0] for run in runs]))
+
+
+def _summed(runs: Sequence[Run], name: str) -> float:
+    """A cost summed over all frames of training, mean over runs."""
+    return float(np.mean([run["history"][-1][f"summed/{name}"] for run in runs]))
 
 
 def _relative(runs: Sequence[Run], limits: Limits, algorithm: str) -> float:
     """Cost of all training in units of PPO's: the mean over the costs of all tasks."""
-
-    def summed(task: str, name: str, of: str) -> float:
-        mine = _select(runs, task, of)
-        return float(np.mean([run["history"][-1][f"summed/{name}"] for run in mine]))
-
     shares = [
-        summed(task, name, algorithm) / max(summed(task, name, "ppo"), 1.0)
+        _summed(_select(runs, task, algorithm), name)
+        / max(_summed(_select(runs, task, "ppo"), name), 1.0)
         for task in _tasks(runs)
         for name in limits[task]
     ]

@@ -1,14 +1,15 @@
 """Policies in another world than that of their training: ``python -m experiments.transfer``.
 
-Plays in the other engine, past wider obstacles, with weaker and stronger motors, with noise in what
-is observed and with actions that come a control step late. Stopped and started again, it goes on.
+Plays in the other engine, past wider obstacles, with weaker and stronger motors, other masses and
+friction, noisy observations, and actions that come a control step late. Stopped and started again,
+it goes on.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -42,12 +43,16 @@ Condition = Literal[
     "wider obstacles",
     "weak motors",
     "strong motors",
+    "heavy links",
+    "light links",
     "heavy object",
     "light object",
+    "rough",
+    "smooth",
     "noise",
     "delay",
 ]
-# By how much sizes, motors and masses change.
+# By how much sizes, motors, masses and friction change.
 _CHANGE = 0.2
 
 
@@ -59,7 +64,7 @@ class Config:
     """Names of policies that come with the package, or files of a suite's policies; by default all
     that come with it."""
     conditions: tuple[Condition, ...] = get_args(Condition)
-    """What is changed: by 20 % where it is a size, a strength or a mass; the noise has a standard
+    """What is changed: a size, a strength, a mass or friction by 20 %; the noise has a standard
     deviation of 0.01 rad, m and so on, the delay is one control step."""
     episodes: int = 256
     """Episodes of each policy under each condition, the same for all."""
@@ -160,7 +165,7 @@ class Delay(Transform):
         return tensordict_reset
 
 
-def lighter(task: SuiteTask, factor: float) -> SuiteTask:
+def scale_object_mass(task: SuiteTask, factor: float) -> SuiteTask:
     """The same task with the mass of its object multiplied."""
     shape = task.task.shape  # type: ignore[attr-defined]
     shape = dataclasses.replace(shape, mass=factor * shape.mass)
@@ -168,8 +173,9 @@ def lighter(task: SuiteTask, factor: float) -> SuiteTask:
 
 
 def applies(task: SuiteTask, condition: Condition) -> bool:
-    """Whether there is something to change."""
-    return bool(task.task.objects) or not condition.endswith("object")
+    """Whether there is something to change; friction is that between gripper, object and table."""
+    with_object = condition.endswith("object") or condition in ("rough", "smooth")
+    return bool(task.task.objects) or not with_object
 
 
 def make_env(
@@ -195,10 +201,18 @@ def make_env(
             settings["scene"] = Scene(motor_strength=1 - _CHANGE)
         case "strong motors":
             settings["scene"] = Scene(motor_strength=1 + _CHANGE)
+        case "heavy links":
+            settings["scene"] = Scene(link_mass=1 + _CHANGE)
+        case "light links":
+            settings["scene"] = Scene(link_mass=1 - _CHANGE)
+        case "rough":
+            settings["scene"] = Scene(friction=1 + _CHANGE)
+        case "smooth":
+            settings["scene"] = Scene(friction=1 - _CHANGE)
         case "heavy object":
-            task = lighter(task, 1 + _CHANGE)
+            task = scale_object_mass(task, 1 + _CHANGE)
         case "light object":
-            task = lighter(task, 1 - _CHANGE)
+            task = scale_object_mass(task, 1 - _CHANGE)
         case "noise":
             settings["observation"] = Noisy(FullObservation(), 0.01, seed=seed)
     env = task.make_env(physics=train.PHYSICS[physics], **settings)
@@ -223,50 +237,41 @@ def run(policy: str, condition: Condition, episodes: int, seed: int) -> dict[str
 
 
 def table(runs: Sequence[dict[str, Any]]) -> str:
-    """Returns a Markdown table: a row for each policy, success and costs under each condition.
+    """Returns a Markdown table: a row for each condition, success and costs of each policy.
 
     A cost above its limit is bold.
     """
     conditions = [*dict.fromkeys(run["condition"] for run in runs)]
-    policies = [*dict.fromkeys((run["policy"], run["task"]) for run in runs)]
-    cells = {(run["policy"], run["condition"]): run["evaluation"] for run in runs}
+    policies = dict.fromkeys((run["policy"], run["task"]) for run in runs)
+    figures = {(run["policy"], run["condition"]): run["evaluation"] for run in runs}
+    limits = {policy: SUITE[task].cost_limits for policy, task in policies}
+    shown = [", ".join(f"{n} {limit:g}" for n, limit in each.items()) for each in limits.values()]
     lines = [
-        "| policy | limits | " + " | ".join(conditions) + " |",
-        "|---" * (2 + len(conditions)) + "|",
+        f"| | {' | '.join(limits)} | within every limit |",
+        "|---" * (2 + len(limits)) + "|",
+        f"| limits | {' | '.join(shown)} | |",
     ]
-    for policy, task in policies:
-        limits = SUITE[task].cost_limits
-        shown = ", ".join(f"{name} {limit:g}" for name, limit in limits.items())
-        row = [_cell(cells[policy, condition], limits) for condition in conditions]
-        lines.append(f"| {policy} | {shown} | " + " | ".join(row) + " |")
-    within = [
-        sum(
-            all(figures[f"cost/{cost}"][0] <= limit for cost, limit in limits_of(task))
-            for policy, task in policies
-            if (figures := cells[policy, condition]) is not None
-        )
-        for condition in conditions
-    ]
-    asked = [sum(cells[policy, c] is not None for policy, _ in policies) for c in conditions]
-    counts = [f"{kept}/{of}" for kept, of in zip(within, asked, strict=True)]
-    lines.append("| within every limit | | " + " | ".join(counts) + " |")
+    for condition in conditions:
+        row = {name: figures[name, condition] for name in limits}
+        played = {name: each for name, each in row.items() if each is not None}
+        kept = sum(not _exceeded(each, limits[name]) for name, each in played.items())
+        cells = [_cell(each, limits[name]) for name, each in row.items()]
+        lines.append(f"| {condition} | {' | '.join(cells)} | {kept}/{len(played)} |")
     lines.append("\nSuccess; the mean of each cost, bold where it is above its limit.")
     return "\n".join(lines)
 
 
-def limits_of(task: str) -> Iterable[tuple[str, float]]:
-    """Costs and their limits."""
-    return SUITE[task].cost_limits.items()
+def _exceeded(figures: Mapping[str, Any], limits: Mapping[str, float]) -> list[str]:
+    return [name for name, limit in limits.items() if figures[f"cost/{name}"][0] > limit]
 
 
-def _cell(figures: dict[str, list[float]] | None, limits: Any) -> str:
+def _cell(figures: Mapping[str, Any] | None, limits: Mapping[str, float]) -> str:
     if figures is None:
         return ""
-    costs = []
-    for name, limit in limits.items():
-        cost = figures[f"cost/{name}"][0]
-        costs.append(f"**{cost:.2f}**" if cost > limit else f"{cost:.2f}")
-    return f"{figures['success'][0]:.0%}; {', '.join(costs)}"
+    above = _exceeded(figures, limits)
+    costs = {name: f"{figures[f'cost/{name}'][0]:.2f}" for name in limits}
+    shown = [f"**{cost}**" if name in above else cost for name, cost in costs.items()]
+    return f"{figures['success'][0]:.0%}; {', '.join(shown)}"
 
 
 def main(config: Config) -> None:

@@ -52,7 +52,8 @@ def test_two_costs_and_their_multipliers(tmp_path, capsys):
 
 def test_an_actor_is_killed_on_the_way():
     env = make_env(2)
-    training = ALGORITHMS["ppo-lagrangian"].build(env, TrainConfig(frames=480))
+    settings = TrainConfig(frames=480, costs=dict.fromkeys(COSTS, 0.5))
+    training = ALGORITHMS["ppo-lagrangian"].build(env, settings)
     env.close()
     with cluster(None) as address:
         collection = Collection(SMALL, training.collector, address)

@@ -1,7 +1,17 @@
 import numpy as np
 import pytest
+import torch
 
-from torchrl_safe.envs import Region
+from torchrl_safe.envs import (
+    Box,
+    Camera,
+    CartesianDelta,
+    Human,
+    InFront,
+    Patrol,
+    Region,
+    Swing,
+)
 
 BOX = Region(low=(0.5, -0.2, 0.1), high=(0.7, 0.2, 0.1))
 
@@ -34,3 +44,23 @@ def test_contains_its_sides_and_nothing_beyond():
 def test_bad_box_is_named(low, high, message):
     with pytest.raises(ValueError, match=message):
         Region(low, high)
+
+
+@pytest.mark.parametrize("give", [list, np.array, torch.tensor])
+def test_points_may_be_lists_arrays_and_tensors(give):
+    """They make the same parts, which can be compared and hashed."""
+    point, beyond = (0.5, -0.25, 0.0), (0.75, 0.25, 0.5)
+    for kind, numbers in (
+        (Box, {"half_extents": beyond}),
+        (InFront, {"direction": point}),
+        (Swing, {"direction": point}),
+        (Patrol, {"direction": point}),
+        (Human, {"shoulder": beyond, "rest": beyond, "pause": (0.5, 1.0)}),
+        (Region, {"low": point, "high": beyond}),
+        (Camera, {"eye": point, "target": beyond}),
+        (CartesianDelta, {"orientation": (0.0, 0.0, 0.0, 1.0)}),
+    ):
+        part = kind(**{name: give(value) for name, value in numbers.items()})
+        same = kind(**numbers)
+        assert part == same
+        assert hash(part) == hash(same)

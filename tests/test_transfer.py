@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -15,17 +16,21 @@ from torchrl.modules import MLP
 
 from experiments import transfer
 from experiments.config import suite_config
+from experiments.pilots import act, make_pilot
 from torchrl_safe.envs import (
+    PANDA,
     SUITE,
     ArmEnv,
     Box,
     Bullet,
     Capsule,
+    CartesianDelta,
     Cylinder,
     FullObservation,
     Human,
     MuJoCo,
     NoObstacles,
+    PickAndPlace,
     Scene,
     Sphere,
 )
@@ -55,14 +60,56 @@ def test_weak_motors_are_slower_and_never_stronger_than_their_share(make_env):
     assert moved[0.01] < moved[0.8] <= moved[1.0] + 1e-4
 
 
+@pytest.mark.usefixtures("engine")
+def test_the_same_motors_move_heavy_links_less(make_env):
+    """From rest at full action, without gravity, with motors that are too weak for it."""
+    moved = {}
+    for mass in (0.5, 1.0, 4.0):
+        scene = Scene(gravity=0.0, motor_strength=0.02, link_mass=mass)
+        env = make_env(ArmEnv, obstacles=NoObstacles(), scene=scene, seed=0)
+        start = env.reset()["observation"].clone()
+        after = step(env, [[1.0, 0.0, 0.0]])["observation"]
+        moved[mass] = (after - start)[0, env.observation_fields["ee_position"]].norm().item()
+    assert moved[4.0] < 0.5 * moved[1.0]
+    assert moved[1.0] < moved[0.5]
+
+
+@pytest.mark.usefixtures("engine")
+def test_what_is_smooth_slips_out_of_the_gripper(make_env):
+    """The same pilot lifts the cube or leaves it on the table."""
+    height = {}
+    for friction in (0.02, 1.0):
+        env = make_env(
+            ArmEnv,
+            PANDA,
+            task=PickAndPlace(),
+            obstacles=NoObstacles(),
+            action=CartesianDelta(finger_step=0.04),
+            scene=Scene(friction=friction, free_fingers=True),
+            max_episode_steps=60,
+            num_envs=2,
+            seed=0,
+        )
+        pilot, heights = make_pilot(env), []
+        env.reset()
+        for _ in range(40):
+            action = torch.as_tensor(act(env, pilot), dtype=torch.float32)
+            step(env, action.tolist())
+            heights.append(env.arm_state.object_position[:, 0, 2].max())
+        height[friction] = max(heights)
+    assert height[0.02] < 0.04 < height[1.0] - 0.03
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"motor_strength": 0.0}, "motor_strength must be positive and finite, got 0.0"),
+        ({"link_mass": -1.0}, "link_mass must be positive and finite, got -1.0"),
+        ({"friction": math.nan}, "friction must be positive and finite, got nan"),
         ({"motor_strength": 0.5, "motor_limits": False}, "must be 1 without motor_limits, got 0.5"),
     ],
 )
-def test_bad_strengths(settings, message):
+def test_bad_factors(settings, message):
     with pytest.raises(ValueError, match=message):
         Scene(**settings)
 
@@ -129,6 +176,10 @@ def test_each_condition_makes_an_environment(make_env, condition):
         "wider obstacles": arm.obstacles.shapes[0].radius == pytest.approx(0.06),
         "weak motors": arm.scene.motor_strength == 0.8,
         "strong motors": arm.scene.motor_strength == 1.2,
+        "heavy links": arm.scene.link_mass == 1.2,
+        "light links": arm.scene.link_mass == 0.8,
+        "rough": arm.scene.friction == 1.2,
+        "smooth": arm.scene.friction == 0.8,
         "heavy object": arm.task.shape.mass == pytest.approx(0.12),
         "light object": arm.task.shape.mass == pytest.approx(0.08),
         "noise": isinstance(arm.observation, transfer.Noisy),
@@ -156,20 +207,18 @@ def test_table_and_folder(tmp_path, capsys):
     )
     transfer.main(config)
     lines = capsys.readouterr().out.splitlines()
-    row = next(line for line in lines if line.startswith("| mine |"))
-    assert row.startswith(f"| mine | collision 0.5, separation {LIMIT:g} | ")
-    assert row.endswith("|  |")
-    (last,) = (line for line in lines if line.startswith("| within every limit"))
-    assert last.endswith("| 0/0 |")
+    head = lines.index("| | mine | within every limit |")
+    _, limits, as_trained, heavy = lines[head + 1 : head + 5]
+    assert limits == f"| limits | collision 0.5, separation {LIMIT:g} | |"
+    assert as_trained.startswith("| as trained | ")
+    assert heavy == "| heavy object |  | 0/0 |"
 
 
 def test_costs_above_their_limits_are_bold():
     figures = {"success": [0.5], "cost/collision": [0.5], "cost/separation": [LIMIT + 0.01]}
     run = {"policy": "p", "task": NAME, "condition": "delay", "evaluation": figures}
-    row, counts = transfer.table([run]).splitlines()[2:4]
-    shown = f"**{LIMIT + 0.01:.2f}**"
-    assert row == f"| p | collision 0.5, separation {LIMIT:g} | 50%; 0.50, {shown} |"
-    assert counts == "| within every limit | | 0/1 |"
+    row = transfer.table([run]).splitlines()[3]
+    assert row == f"| delay | 50%; 0.50, **{LIMIT + 0.01:.2f}** | 0/1 |"
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,22 @@ def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.fl
     return array
 
 
+def keep_numbers(part: Any, name: str, count: int) -> NDArray[np.float64]:
+    """Makes a field of a frozen dataclass a tuple of numbers, from a list, an array or a tensor.
+
+    Returns:
+        The numbers, ``(count,)``.
+
+    Raises:
+        ValueError: unless there are so many, and they are finite.
+    """
+    value = getattr(part, name)
+    array = check_array(name, value, (count,))
+    if not isinstance(value, tuple):
+        object.__setattr__(part, name, tuple(array.tolist()))
+    return array
+
+
 def _is_finite(value: Any) -> bool:
     try:
         return isinstance(value, Real) and math.isfinite(value)

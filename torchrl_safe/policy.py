@@ -252,8 +252,9 @@ def load_policy(path: str | Path) -> Policy:
 
         See :func:`save_policy` for an example that runs.
     """
-    chosen, shipped = Path(path), shipped_policies()
+    chosen = Path(path)
     if not chosen.is_file():
+        shipped = shipped_policies()
         if str(path) not in shipped:
             raise FileNotFoundError(
                 f"path must be a file or one of {', '.join(shipped)}, got {str(path)!r}."

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe._checks import check_array
+from torchrl_safe._checks import keep_numbers
 from torchrl_safe.envs.state import Array
 
 
@@ -44,7 +44,7 @@ class Region:
     high: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        low, high = check_array("low", self.low, (3,)), check_array("high", self.high, (3,))
+        low, high = keep_numbers(self, "low", 3), keep_numbers(self, "high", 3)
         if not np.all(low <= high):
             raise ValueError(f"low must not exceed high, got {self.low} and {self.high}.")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from torchrl_safe._checks import check_array, check_kind
+from torchrl_safe._checks import check_array, check_kind, keep_numbers
 from torchrl_safe.envs.regions import Region
 
 
@@ -35,8 +35,8 @@ class Gripper:
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_array("position", self.position, (3,))
-        check_array("rotation", self.rotation, (3,))
+        keep_numbers(self, "position", 3)
+        keep_numbers(self, "rotation", 3)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class ArmModel:
         if self.gripper is not None:
             check_kind("gripper", self.gripper, Gripper)
         if self.handling_orientation is not None:
-            check_array("handling_orientation", self.handling_orientation, (4,))
+            keep_numbers(self, "handling_orientation", 4)
 
 
 # Turned by a quarter, a hand shows its narrow side to what is beside the object; to which side,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_safe._checks import check_array, check_positive
+from torchrl_safe._checks import check_positive, keep_numbers
 from torchrl_safe.envs.obstacles.layouts import Placement
 from torchrl_safe.envs.obstacles.shapes import Capsule, Look, Part, Shape, Sphere
 from torchrl_safe.envs.rotations import from_z_axis
@@ -63,10 +63,10 @@ class Human:
     pause: tuple[float, float] = (0.1, 0.8)
 
     def __post_init__(self) -> None:
-        shoulder = check_array("shoulder", self.shoulder, (3,))
-        rest = check_array("rest", self.rest, (3,))
+        shoulder = keep_numbers(self, "shoulder", 3)
+        rest = keep_numbers(self, "rest", 3)
         for name in ("duration", "pause"):
-            shortest, longest = check_array(name, getattr(self, name), (2,))
+            shortest, longest = keep_numbers(self, name, 2)
             check_positive(**{name: float(shortest)})
             if shortest > longest:
                 raise ValueError(f"{name} must be shortest, longest, got {shortest}, {longest}.")
@@ -99,7 +99,7 @@ class Human:
         waits = rng.uniform(*self.pause, (_REACHES, 2))
         moves = rng.uniform(*self.duration, (_REACHES, 2))
         spans = np.stack([waits[:, 0], moves[:, 0], waits[:, 1], moves[:, 1]], axis=1).ravel()
-        rest = np.repeat(np.array([self.rest]), _REACHES, axis=0)
+        rest = np.tile(self.rest, (_REACHES, 1))
         stops = np.stack([rest, rest, targets, targets], axis=1).reshape(-1, 3)
         begins = np.cumsum(spans) - spans
 

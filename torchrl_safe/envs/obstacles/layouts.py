@@ -15,6 +15,7 @@ from torchrl_safe._checks import (
     check_kind,
     check_not_negative,
     check_positive,
+    keep_numbers,
 )
 from torchrl_safe.envs.obstacles.shapes import Cylinder, Shape, footprint
 from torchrl_safe.envs.regions import NoRoomError, Region
@@ -174,7 +175,7 @@ class InFront:
                 f"{footprint(self.shape):.3f}, got {self.gap}."
             )
         if self.direction is not None:
-            direction = check_array("direction", self.direction, (3,))
+            direction = keep_numbers(self, "direction", 3)
             if direction[2] != 0 or not direction.any():
                 raise ValueError(
                     f"direction must be horizontal and not zero, got {self.direction}."

@@ -8,15 +8,15 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe._checks import check_array, check_kind, check_positive
+from torchrl_safe._checks import check_array, check_kind, check_positive, keep_numbers
 from torchrl_safe.envs.obstacles.layouts import InFront, Obstacles, Placement
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.state import Array
 
 
-def _check_direction(direction: tuple[float, float, float] | None) -> None:
-    if direction is not None and not check_array("direction", direction, (3,)).any():
-        raise ValueError(f"direction must not be zero, got {direction}.")
+def _check_direction(motion: Swing | Patrol) -> None:
+    if motion.direction is not None and not keep_numbers(motion, "direction", 3).any():
+        raise ValueError(f"direction must not be zero, got {motion.direction}.")
 
 
 def _unit(direction: tuple[float, float, float] | None, across: Array) -> Array:
@@ -62,7 +62,7 @@ class Swing:
 
     def __post_init__(self) -> None:
         check_positive(amplitude=self.amplitude, period=self.period)
-        _check_direction(self.direction)
+        _check_direction(self)
 
     def sample(self, rng: np.random.Generator, across: Array) -> Callable[[Array], Array]:
         phase, along = rng.uniform(0, 2 * np.pi), _unit(self.direction, across)
@@ -100,7 +100,7 @@ class Patrol:
 
     def __post_init__(self) -> None:
         check_positive(distance=self.distance, speed=self.speed)
-        _check_direction(self.direction)
+        _check_direction(self)
 
     def sample(self, rng: np.random.Generator, across: Array) -> Callable[[Array], Array]:
         begin, along = rng.uniform(0, 2 * self.distance), _unit(self.direction, across)

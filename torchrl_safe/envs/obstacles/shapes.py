@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchrl_safe._checks import check_array, check_not_negative, check_positive
+from torchrl_safe._checks import check_not_negative, check_positive, keep_numbers
 from torchrl_safe.envs.rotations import UPRIGHT
 
 
@@ -32,8 +32,8 @@ class Part:
     orientation: tuple[float, float, float, float] = UPRIGHT
 
     def __post_init__(self) -> None:
-        check_array("position", self.position, (3,))
-        check_array("orientation", self.orientation, (4,))
+        keep_numbers(self, "position", 3)
+        keep_numbers(self, "orientation", 4)
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Look:
     parts: tuple[Part, ...] = ()
 
     def __post_init__(self) -> None:
-        colour = check_array("colour", self.colour, (3,))
+        colour = keep_numbers(self, "colour", 3)
         if not ((colour >= 0) & (colour <= 1)).all():
             raise ValueError(f"colour must be three numbers from 0 to 1, got {self.colour}.")
 
@@ -116,7 +116,7 @@ class Box:
     look: Look | None = field(default=None, repr=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not (check_array("half_extents", self.half_extents, (3,)) > 0).all():
+        if not (keep_numbers(self, "half_extents", 3) > 0).all():
             raise ValueError(f"half_extents must be positive, got {self.half_extents}.")
         check_not_negative(mass=self.mass)
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from torchrl_safe._checks import check_array, check_flag, check_positive
+from torchrl_safe._checks import check_array, check_flag, check_positive, keep_numbers
 
 #: Duration of one physics substep, s.
 SUBSTEP = 1 / 240
@@ -21,11 +19,14 @@ class Scene:
         free_fingers: leave the joints that are not part of the arm movable.
         motor_limits: keep the motors within the efforts and speeds of the URDF.
         motor_strength: share of the URDF's efforts that the motors have.
+        link_mass: factor of the masses and inertias of the arm's links. The motors are tuned to the
+            masses of the URDF.
+        friction: factor of the friction between any two surfaces.
 
     Raises:
         TypeError: if a flag is not True or False.
-        ValueError: if ``gravity`` is not finite, ``motor_strength`` is not positive, or it is not 1
-            for motors without limits.
+        ValueError: if ``gravity`` is not finite, a factor is not positive, or ``motor_strength`` is
+            not 1 for motors without limits.
 
     Examples:
         >>> Scene(gravity=1.62).motor_limits
@@ -36,10 +37,14 @@ class Scene:
     free_fingers: bool = False
     motor_limits: bool = True
     motor_strength: float = 1.0
+    link_mass: float = 1.0
+    friction: float = 1.0
 
     def __post_init__(self) -> None:
         check_array("gravity", self.gravity, ())
-        check_positive(motor_strength=self.motor_strength)
+        check_positive(
+            motor_strength=self.motor_strength, link_mass=self.link_mass, friction=self.friction
+        )
         check_flag(free_fingers=self.free_fingers, motor_limits=self.motor_limits)
         if self.motor_strength != 1 and not self.motor_limits:
             raise ValueError(
@@ -74,9 +79,7 @@ class Camera:
     shadows: bool = False
 
     def __post_init__(self) -> None:
-        if np.array_equal(
-            check_array("eye", self.eye, (3,)), check_array("target", self.target, (3,))
-        ):
+        if (keep_numbers(self, "eye", 3) == keep_numbers(self, "target", 3)).all():
             raise ValueError(f"eye must not be where it looks, got {self.eye} for both.")
         check_positive(field_of_view=self.field_of_view)
         check_flag(shadows=self.shadows)

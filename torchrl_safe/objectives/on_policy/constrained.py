@@ -90,7 +90,11 @@ class ConstrainedLoss(CostCritic):
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
-        """All outputs but those of the cost critic.
+        """Returns all outputs but those of the cost critic. A loss of your own overrides it.
+
+        It may call ``self.evaluate(tensordict)``, the present policy, and
+        ``self.unconstrained(tensordict, advantage, policy)``, the outputs of ``ClipPPOLoss`` for
+        any advantage of shape ``(*B, 1)``.
 
         Args:
             tensordict (TensorDictBase): the data, a copy that may be written to.

@@ -181,6 +181,20 @@ def load_furniture(
     return [body]
 
 
+def scale_dynamics(client: int, body: int, *, mass: float = 1.0, friction: float = 1.0) -> None:
+    """Multiplies masses and inertias of a body's links, and the friction of its surfaces."""
+    for link in range(-1, pybullet.getNumJoints(body, physicsClientId=client)):
+        info = pybullet.getDynamicsInfo(body, link, physicsClientId=client)
+        pybullet.changeDynamics(
+            body,
+            link,
+            mass=mass * info[0],
+            localInertiaDiagonal=[mass * inertia for inertia in info[2]],
+            lateralFriction=friction * info[1],
+            physicsClientId=client,
+        )
+
+
 def load_body(client: int, urdf: str, position: Sequence[float]) -> int:
     """Loads a URDF file of ``pybullet_data`` that is free to move."""
     return pybullet.loadURDF(_data(urdf), position, physicsClientId=client)

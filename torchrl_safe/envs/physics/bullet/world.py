@@ -21,6 +21,7 @@ from torchrl_safe.envs.physics.bullet.bodies import (
     load_arm,
     load_body,
     load_furniture,
+    scale_dynamics,
 )
 from torchrl_safe.envs.physics.bullet.engine import pybullet
 from torchrl_safe.envs.physics.bullet.readings import MovingBody, Readings, Vector, link_state
@@ -140,6 +141,13 @@ class World:
         self._movable = [body for body, fixed in bodies if not fixed] + self._objects
         if self._brick is not None:
             self._movable.append(self._brick)
+        if scene.link_mass != 1:
+            scale_dynamics(client, self._arm.body, mass=scene.link_mass)
+        if scene.friction != 1:
+            for number in range(pybullet.getNumBodies(physicsClientId=client)):
+                body = pybullet.getBodyUniqueId(number, physicsClientId=client)
+                # Bullet multiplies the frictions of the two that touch.
+                scale_dynamics(client, body, friction=scene.friction**0.5)
         if self._movable:
             # Bullet solves bodies that are, or once were, near each other together, with as many
             # iterations as the slowest needs. Only if all take the same number does the past not

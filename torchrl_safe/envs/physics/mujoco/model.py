@@ -90,6 +90,8 @@ def build_world(
     moved = add_rotors(spec, parts, np.diag(mass)[velocity])
     model = spec.compile()
     set_gains(model, parts, moved, limited=scene.motor_limits)
+    model.geom_friction[:, 0] *= scene.friction
+    _scale_mass(model, links, scene.link_mass)
     return World(
         model=model,
         parts=parts,
@@ -98,6 +100,16 @@ def build_world(
         velocity=velocity,
         home=data.qpos.copy(),
     )
+
+
+def _scale_mass(model: Any, links: set[str], factor: float) -> None:
+    """Multiplies the masses of some bodies, and what MuJoCo has derived from them."""
+    if factor == 1:
+        return
+    bodies = [model.body(name).id for name in links]
+    model.body_mass[bodies] *= factor
+    model.body_inertia[bodies] *= factor
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def build_scenery(

@@ -77,7 +77,7 @@ class Painter:
 
 
 def _view(camera: Camera) -> Any:
-    eye, target = np.array(camera.eye, dtype=float), np.array(camera.target, dtype=float)
+    eye, target = np.array(camera.eye), np.array(camera.target)
     x, y, z = target - eye
     view = mujoco.MjvCamera()
     view.type, view.lookat[:] = mujoco.mjtCamera.mjCAMERA_FREE, target
