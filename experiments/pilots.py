@@ -64,7 +64,7 @@ class Care:
 #: Keeps the limits of the suite with something to spare.
 CAREFUL = Care(over=0.13, slope=5, aside=0.035, narrower=(0, 0), room=0.11, time=0.5)
 #: Does the task as surely, sooner, and does not keep the limits.
-HURRIED = Care(over=0.1, slope=1.5, aside=-0.01, narrower=(0.03, 0.01), room=0.066, time=0.3)
+HURRIED = Care(over=0.1, slope=1.5, aside=-0.01, narrower=(0.03, 0.01), room=0.075, time=0.4)
 
 
 class Pilot(Protocol):

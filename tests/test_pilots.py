@@ -103,7 +103,7 @@ def test_who_is_in_a_hurry_does_the_task_and_violates_a_limit(make_env, name, vi
     success, cost = fly(env, care=HURRIED)
     assert success.mean() >= 0.95
     costs = dict(zip(env.cost_names, cost.mean(0), strict=True))
-    assert costs[violated] >= 3 * task.cost_limits[violated]
+    assert costs[violated] >= 2 * task.cost_limits[violated]
 
 
 @pytest.mark.parametrize("task", ["push", "pick"])
