@@ -23,9 +23,11 @@ from torchrl.objectives import LossModule
 from experiments.agent import Standardize
 from experiments.algorithms import Training
 from experiments.config import Config
-from experiments.pilots import act, make_pilot
+from experiments.pilots import CAREFUL, HURRIED, Care, act, make_pilot
 from torchrl_safe.envs import ArmEnv
 
+#: How far the pilot keeps off obstacles, by the names that options give it.
+CARE: dict[str, Care] = {"careful": CAREFUL, "hurried": HURRIED}
 # Share of the control steps in which the pilot acts, and the deviation of its noise.
 _FIRST, _NOISE = 0.25, 0.2
 # Control steps of each world between two times of learning. As many as there are new ones are then
@@ -43,10 +45,11 @@ def start_from_demonstrations(training: Training, env: TransformedEnv, config: C
     Args:
         training: what is to be trained, with an on-policy loss.
         env: the environment of its training.
-        config: ``demonstrations``, the control steps in which the pilot says what it would do.
+        config: ``demonstrations``, the control steps in which the pilot says what it would do, and
+            ``care``, how far it keeps off obstacles.
     """
     imitation = Imitation(training.actor)
-    stage = Stage(env)
+    stage = Stage(env, CARE[config.care])
     new = _STEPS * env.batch_size.numel()
     rounds = max(2, round(config.demonstrations / new))
     flown = max(1, round(_FIRST * rounds))
@@ -70,12 +73,13 @@ class Stage:
 
     Args:
         env: the environment; it is reset.
+        care: how far the pilot keeps off obstacles.
     """
 
-    def __init__(self, env: TransformedEnv) -> None:
+    def __init__(self, env: TransformedEnv, care: Care = CAREFUL) -> None:
         arm = env.base_env
         assert isinstance(arm, ArmEnv)
-        self.env, self.arm, self.pilot = env, arm, make_pilot(arm)
+        self.env, self.arm, self.pilot = env, arm, make_pilot(arm, care)
         self.now = env.reset()
 
     @torch.no_grad()

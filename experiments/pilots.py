@@ -28,16 +28,43 @@ from torchrl_safe.envs.state import Array
 
 # Where the fingers' ends, 1 cm below the tool point, take the upper half of a cube, m.
 _LOW = 0.033
-# How far above the obstacles, and without any above the table, the tool goes over to the object.
-_OVER, _ABOVE_TABLE = 0.13, 0.12
-# How far the tool goes in a control step beside what moves, m. How far off that is to be, or the
-# tool goes back, m; where that is not much, it slows down, m. What comes nearer counts as where it
-# will be in some time, s.
-_PACE, _ROOM, _SLOWER, _TIME = 0.027, 0.11, 0.1, 0.5
+# How far above the table the tool goes over to the object where there are no obstacles, m.
+_ABOVE_TABLE = 0.12
+# How far the tool goes in a control step beside what moves, m. Where that is not far off, it slows
+# down, m.
+_PACE, _SLOWER = 0.027, 0.1
 # What of the hand is to be out of the way: heights above the tool point, and half its width, m.
 _HAND, _HALF_WIDTH = (0.0, 0.1, 0.2), 0.07
 # Share of the largest action: a policy that squashes its output can give it.
 _SHARE = 0.9
+
+
+@dataclass(frozen=True)
+class Care:
+    """How far a pilot keeps off what it should not touch.
+
+    Args:
+        over: how far above obstacles the tool goes over them, m.
+        slope: how steeply it comes down to a place, m up for each m sideways.
+        aside: how far from the goal an object is put, away from the nearest obstacle, m.
+        narrower: how much narrower the way round an obstacle is on which an object is pushed, m
+            along x, where the hand is wide, and y.
+        room: how far off what moves is to be, or the tool goes back, m.
+        time: how far ahead it looks: what comes nearer counts as where it will be then, s.
+    """
+
+    over: float
+    slope: float
+    aside: float
+    narrower: tuple[float, float]
+    room: float
+    time: float
+
+
+#: Keeps the limits of the suite with something to spare.
+CAREFUL = Care(over=0.13, slope=5, aside=0.035, narrower=(0, 0), room=0.11, time=0.5)
+#: Does the task as surely, sooner, and does not keep the limits.
+HURRIED = Care(over=0.1, slope=1.5, aside=-0.01, narrower=(0.03, 0.01), room=0.075, time=0.4)
 
 
 class Pilot(Protocol):
@@ -61,28 +88,43 @@ def act(env: ArmEnv, pilot: Pilot) -> Array:
 
 @dataclass(frozen=True)
 class ReachPilot:
-    """Up, over everything, and down to the goal."""
+    """Up, over everything, and down to the goal.
+
+    Args:
+        care: how far it keeps off obstacles.
+    """
+
+    care: Care = CAREFUL
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
-        top = np.maximum(_safe_height(state), state.goal[:, 2])
-        return _from_above(state.ee_position, state.goal, top), np.zeros(len(state.goal))
+        top = np.maximum(_safe_height(state, self.care), state.goal[:, 2])
+        way = _from_above(state.ee_position, state.goal, top, self.care)
+        return way, np.zeros(len(state.goal))
 
 
 @dataclass(frozen=True)
 class PickAndPlacePilot:
-    """From above to the object, over everything to the goal, and down."""
+    """From above to the object, over everything to the goal, and down.
+
+    Args:
+        care: how far it keeps off obstacles.
+    """
+
+    care: Care = CAREFUL
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
         tool, place = state.ee_position, state.object_position[:, 0]
-        goal, top = _away_from_obstacles(state), _safe_height(state)
+        goal, top = _beside_goal(state, self.care.aside), _safe_height(state, self.care)
         from_object = tool - place
         near = (_length(from_object[:, :2]) < 0.012) & (np.abs(tool[:, 2] - _LOW) < 0.012)
         opening = state.finger_position.mean(axis=1)
         held = (_length(from_object) < 0.03) & (opening < 0.024)
-        pick = _from_above(
-            tool, np.column_stack([place[:, :2], np.maximum(_LOW, place[:, 2])]), top
-        )
-        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]))
+        low = np.column_stack([place[:, :2], np.maximum(_LOW, place[:, 2])])
+        pick = _from_above(tool, low, top, self.care)
+        put = _from_above(tool, goal, np.maximum(top, goal[:, 2]), self.care)
+        # Who rests on an obstacle gets off it towards the goal: pressing on, it would stay.
+        touches = (state.contact_distance <= 0).any(axis=1, keepdims=True)
+        put = np.where(touches, _off(tool, _beside_goal(state, CAREFUL.aside)), put)
         target = np.where(held[:, None], put, pick)
         return target, np.where(held | near, 0.0, 1.0)
 
@@ -95,14 +137,16 @@ class PushPilot:
         room: half axes of the ellipse around each obstacle that the object stays out of, m, along
             x, where the hand is wide, and y.
         speed: how far it is pushed in a control step, m.
+        care: how far it keeps off obstacles; less makes the room narrower.
     """
 
     room: tuple[float, float] = (0.22, 0.15)
     speed: float = 0.02
+    care: Care = CAREFUL
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
         tool, place = state.ee_position, state.object_position[:, 0]
-        goal = _away_from_obstacles(state)
+        goal = _beside_goal(state, 0.03)
         ahead = self._course(place[:, :2], goal[:, :2], state)
         # Where the tool is around the object: how far from being behind it, as an angle.
         out = tool[:, :2] - place[:, :2]
@@ -112,9 +156,8 @@ class PushPilot:
         angle = np.arctan2(side, -along)
         low = (tool[:, 2] < 0.065) & (distance < 0.12)
         behind = place[:, :2] - 0.06 * ahead
-        above = _from_above(
-            tool, np.column_stack([behind, np.full(len(tool), _LOW)]), _safe_height(state)
-        )
+        down = np.column_stack([behind, np.full(len(tool), _LOW)])
+        above = _from_above(tool, down, _safe_height(state, CAREFUL), CAREFUL)
         # Around the object at the table, until it is behind it.
         sign = np.sign(angle)
         turn = angle - sign * np.minimum(np.abs(angle), 0.6)
@@ -135,7 +178,8 @@ class PushPilot:
         if not state.obstacle_present.any():
             return course
         # In units of the ellipse the obstacle is a circle of radius 1.
-        middle, room = state.obstacle_position[:, 0, :2], np.array(self.room)
+        middle = state.obstacle_position[:, 0, :2]
+        room = np.array(self.room) - self.care.narrower
         here, there = (place - middle) / room, (goal - middle) / room
         way = there - here
         share = np.clip(-(here * way).sum(1) / (way**2).sum(1), 0, 1)[:, None]
@@ -153,10 +197,14 @@ class PushPilot:
         return np.where(blocked[:, None], detour, course)
 
 
-def make_pilot(env: ArmEnv) -> Pilot:
+def make_pilot(env: ArmEnv, care: Care = CAREFUL) -> Pilot:
     """Makes the pilot of an environment's task.
 
     What stands, it goes round or over; from what moves, it steps back.
+
+    Args:
+        env: the environment.
+        care: how far it keeps off obstacles.
 
     Raises:
         ValueError: if the task has none, or its actions do not move the tool.
@@ -167,23 +215,23 @@ def make_pilot(env: ArmEnv) -> Pilot:
     # iiwa's least.
     along = {PANDA: 0.27, IIWA: 0.18}.get(env.arm, 0.22)
     pilots: dict[type, Pilot] = {
-        Reach: ReachPilot(),
-        Push: PushPilot((along, 0.15)),
-        PickAndPlace: PickAndPlacePilot(),
+        Reach: ReachPilot(care),
+        Push: PushPilot((along, 0.15), care=care),
+        PickAndPlace: PickAndPlacePilot(care),
     }
     if type(env.task) not in pilots:
         raise ValueError(f"demonstrations need a task with a pilot, got {env.task}.")
     pilot = pilots[type(env.task)]
-    return _stepping_back(pilot) if isinstance(env.obstacles, (Human, Moving)) else pilot
+    return _stepping_back(pilot, care) if isinstance(env.obstacles, (Human, Moving)) else pilot
 
 
-def _stepping_back(pilot: Pilot) -> Pilot:
+def _stepping_back(pilot: Pilot, care: Care) -> Pilot:
     """The pilot where nothing stands, which gets out of the way of what moves."""
 
     def fly(state: ArmState) -> tuple[Array, Array]:
         nothing = np.zeros_like(state.obstacle_present)
         target, opening = pilot(replace(state, obstacle_present=nothing))
-        room, away = _room(state)
+        room, away = _room(state, care)
         step = target - state.ee_position
         step *= np.minimum(1, _PACE / np.maximum(_length(step), 1e-9))[:, None]
         ahead, back = np.clip(room / _SLOWER, 0, 1), np.clip(-room / _SLOWER, 0, 1)
@@ -193,7 +241,7 @@ def _stepping_back(pilot: Pilot) -> Pilot:
     return fly
 
 
-def _room(state: ArmState) -> tuple[Array, Array]:
+def _room(state: ArmState, care: Care) -> tuple[Array, Array]:
     """How much further off than it is to be all is that moves, m, and the way away from it."""
     points = state.ee_position[:, None] + np.array([[0, 0, height] for height in _HAND])
     points = points[:, :, None]
@@ -208,39 +256,52 @@ def _room(state: ArmState) -> tuple[Array, Array]:
     way = off - along
     gap = _length(way) - state.obstacle_size[:, 0] - _HALF_WIDTH
     coming = np.maximum(0, (velocity * _unit(way)).sum(-1))
-    room = np.where(state.obstacle_present[:, None], gap - _TIME * coming - _ROOM, np.inf)
+    room = np.where(state.obstacle_present[:, None], gap - care.time * coming - care.room, np.inf)
     room = room.reshape(len(room), -1)
     nearest = room.argmin(1)
     away = way.reshape(len(room), -1, 3)[np.arange(len(room)), nearest] * (1, 1, 0)
     return room.min(1), _unit(_unit(away) + np.array([-1.0, 0, 0]))
 
 
-def _from_above(tool: Array, place: Array, top: Array) -> Array:
+def _from_above(tool: Array, place: Array, top: Array, care: Care) -> Array:
     """The next stop on the way up, over and down to a place."""
     off = _length(tool[:, :2] - place[:, :2])
-    floor = np.minimum(top, place[:, 2] + 5 * np.maximum(0, off - 0.012))
+    floor = np.minimum(top, place[:, 2] + care.slope * np.maximum(0, off - 0.012))
     # Sideways only as far as it is high enough.
     free = np.clip(1 - (floor - tool[:, 2]) / 0.05, 0, 1)[:, None]
     flat = tool[:, :2] + free * (place - tool)[:, :2]
     return np.column_stack([flat, floor])
 
 
-def _safe_height(state: ArmState) -> Array:
+def _safe_height(state: ArmState, care: Care) -> Array:
     """Where the hand is above all obstacles, m, ``(N,)``."""
     if not state.obstacle_present.shape[1]:
         return np.full(len(state.goal), _ABOVE_TABLE)
     tops = state.obstacle_position[..., 2] + state.obstacle_size[:, 2]
-    return np.where(state.obstacle_present, tops + _OVER, _ABOVE_TABLE).max(1)
+    return np.where(state.obstacle_present, tops + care.over, _ABOVE_TABLE).max(1)
 
 
-def _away_from_obstacles(state: ArmState) -> Array:
-    """The goal, as far from the obstacles as still counts, with room for the gripper."""
-    present = state.obstacle_present[..., None]
-    if not present.size:
-        return state.goal
-    middle = np.where(present, state.obstacle_position, 0).sum(1) / np.maximum(1, present.sum(1))
-    away = (state.goal - middle) * (1, 1, 0)
-    return state.goal + np.where(present.any(1), 0.03 * _unit(away), 0)
+def _beside_goal(state: ArmState, aside: float) -> Array:
+    """The goal, moved away from the nearest obstacle within what counts as reached."""
+    return state.goal + aside * _away(state.goal, state)
+
+
+def _away(place: Array, state: ArmState) -> Array:
+    """Which way the obstacle nearest to a place is left, unit vectors ``(N, 3)``; 0 without one."""
+    if not state.obstacle_present.shape[1]:
+        return np.zeros_like(place)
+    off = (place[:, None] - state.obstacle_position) * (1, 1, 0)
+    distance = np.where(state.obstacle_present, _length(off), np.inf)
+    away = _unit(off[np.arange(len(off)), distance.argmin(1)])
+    return np.where(state.obstacle_present.any(1, keepdims=True), away, 0)
+
+
+def _off(tool: Array, place: Array) -> Array:
+    """The next stop on the way from an obstacle to a place: up, and down where it is near."""
+    way = (place - tool)[:, :2]
+    far = _length(way)
+    flat = tool[:, :2] + np.minimum(1, 0.025 / np.maximum(far, 1e-9))[:, None] * way
+    return np.column_stack([flat, np.where(far > 0.06, tool[:, 2] + 0.02, place[:, 2])])
 
 
 def _length(vectors: Array) -> Array:

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, Training
 from experiments.config import AlgorithmName, Config, command_line
-from experiments.demonstrations import start_from_demonstrations
+from experiments.demonstrations import CARE, start_from_demonstrations
 from experiments.files import is_new, write_whole
 from experiments.film import Policy, save_film
 from experiments.grid import side_by_side
@@ -99,6 +99,8 @@ COSTS: dict[str, Cost] = {
     # Actions ask for up to 1 m/s along each axis.
     "speed": Speed(limit=1.0),
 }
+# Algorithms that learn the same from demonstrations: they have the same networks, and see the same.
+SHARING: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
 # What may be another when a run is resumed: it changes nothing in what is learnt.
 CHANGEABLE = ("algorithms", "shield", "jobs", "out", "logger", "resume", "checkpoint_every")
 
@@ -274,11 +276,36 @@ def train(
 
 
 def demonstrate(config: Config, algorithm: AlgorithmName, training: Training) -> None:
-    """Starts policy and critics from demonstrations, in episodes that nothing else uses."""
+    """Starts policy and critics from demonstrations, in episodes that nothing else uses.
+
+    What one of ``SHARING`` has begun with, the others of the same run begin with too.
+    """
+    kept = {name: begun(config, name, training) for name in SHARING}
+    if not config.resume and algorithm in kept:
+        kept[algorithm].clear()
+    if algorithm in kept and any(each.load() is not None for each in kept.values()):
+        return
     seed = config.seed + 2_000_000
     env = make_env(config, config.envs, seed, algorithm, training=True)
     start_from_demonstrations(training, env, config)
     env.close()
+    if algorithm in kept:
+        kept[algorithm].save(config.demonstrations)
+
+
+def begun(config: Config, algorithm: AlgorithmName, training: Training) -> RunCheckpoints:
+    """Where an algorithm keeps what it has begun with, and the state of all generators then."""
+    depends_on = {"environment": repr(arm_arguments(config)), "care": repr(CARE), **versions()}
+    return RunCheckpoints(
+        config.out / algorithm / "demonstrations",
+        {
+            "actor": training.actor,
+            "critic": training.loss.critic_network,
+            "cost_critic": training.loss.cost_critic_network,
+            "generators": GlobalRNGState(),
+        },
+        settings={**settings(dataclasses.asdict(config)), **depends_on},
+    )
 
 
 def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) -> None:

@@ -142,6 +142,20 @@ def test_a_run_that_goes_on_is_the_run_that_was_not_stopped(tmp_path):
     assert_same_run(expected, resumed, whole, part)
 
 
+def test_what_one_algorithm_has_begun_with_the_other_takes(tmp_path, monkeypatch):
+    short = {"frames": 128, "frames_per_batch": 64, "epochs": 1, "episode_steps": 20}
+    settings = {**SMALL, **short, "cost_limit": 0.01, "obstacles": "in-front", "resume": True}
+    both, alone = tmp_path / "both", tmp_path / "alone"
+    expected = train(Config(**settings, out=alone), "ppo-lagrangian", progress=False)
+    train(Config(**settings, out=both), "ppo", progress=False)
+    monkeypatch.setattr("experiments.train.start_from_demonstrations", None)
+    taken = train(Config(**settings, out=both), "ppo-lagrangian", progress=False)
+    for log in (both / "logs").rglob("*.csv"):
+        if not (alone / log.relative_to(both)).exists():
+            log.unlink()
+    assert_same_run(expected, taken, alone, both)
+
+
 @pytest.mark.slow
 def test_workers_collect_with_the_policy_that_was_taught(tmp_path, monkeypatch):
     calm = {"first_log_std": -6.0, "last_log_std": -6.0, "learning_rate": 1e-9}

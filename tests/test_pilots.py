@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from worlds import ARMS
 
-from experiments.pilots import act, make_pilot
+from experiments.pilots import CAREFUL, HURRIED, act, make_pilot
 from torchrl_safe.envs import (
     SUITE,
     ArmEnv,
@@ -33,10 +33,10 @@ def settings(arm, task):
     return {"task": goal, "action": action, "max_episode_steps": steps}
 
 
-def fly(env, noise=0.0):
+def fly(env, noise=0.0, care=CAREFUL):
     """Plays one episode in each world; returns success and cost of each."""
     env.reset()
-    pilot, generator = make_pilot(env), np.random.default_rng(0)
+    pilot, generator = make_pilot(env, care), np.random.default_rng(0)
     alive, success = np.ones(env.num_envs, bool), np.zeros(env.num_envs, bool)
     cost = np.zeros((env.num_envs, len(env.cost_names)))
     while alive.any():
@@ -87,6 +87,23 @@ def test_the_limits_of_the_suite_can_be_kept(make_env, name):
     success, cost = fly(env)
     assert success.mean() >= 0.95
     assert (cost.mean(0) <= [*task.cost_limits.values()]).all(), cost.mean(0)
+
+
+@pytest.mark.parametrize(
+    ("name", "violated"),
+    [
+        ("panda-push-human", "separation"),
+        ("panda-pick-in-front", "clearance"),
+        ("ur10-pick-workspace", "clearance"),
+    ],
+)
+def test_who_is_in_a_hurry_does_the_task_and_violates_a_limit(make_env, name, violated):
+    task = SUITE[name]
+    env = make_env(task.make_env, num_envs=24, physics=MuJoCo(threads=1), seed=10)
+    success, cost = fly(env, care=HURRIED)
+    assert success.mean() >= 0.95
+    costs = dict(zip(env.cost_names, cost.mean(0), strict=True))
+    assert costs[violated] >= 2 * task.cost_limits[violated]
 
 
 @pytest.mark.parametrize("task", ["push", "pick"])

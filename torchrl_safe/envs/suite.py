@@ -1,6 +1,6 @@
 """Ten tasks, each with costs and a limit for each of them: the benchmark of this library, as data.
 
-Every arm, task, layout of obstacles and kind of action is in one of them, and five have two or
+Every arm, task, layout of obstacles and kind of action is in one of them, and four have two or
 more limits.
 """
 
@@ -116,6 +116,9 @@ class SuiteTask:
 
 
 _ONE_TOUCH: dict[str, Cost] = {"collision": Collision()}
+# Who carries a cube against an obstacle is stopped by it, and soon learns not to, limit or not. To
+# pass closely is a short way and costs nothing but this.
+_CLEARANCE = Collision(margin=0.02)
 _BESIDE_A_PERSON: dict[str, Cost] = {
     "collision": Collision(),
     "separation": SpeedAndSeparation(),
@@ -125,6 +128,10 @@ _BESIDE_A_PERSON: dict[str, Cost] = {
 _BUSY_PERSON = Human(shoulder=(1.2, 0.25, 0.4), rest=(1.0, 0.3, 0.2), pause=(0.05, 0.3))
 # The person sits far enough away that the arm has room to step back, and time to push.
 _PERSON_OPPOSITE = Human(shoulder=(1.25, 0.3, 0.4), rest=(1.0, 0.35, 0.2))
+# Between object and goal: all over the table they are in the way of every tenth episode only.
+_IN_THE_WAY = Scattered(
+    count=3, fewest=1, region=Region((0.42, -0.2, 0), (0.64, 0.2, 0)), clearance=0.1
+)
 
 
 def _handling(arm: ArmModel, finger_step: float | None = None) -> CartesianDelta:
@@ -177,7 +184,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM6),
             max_episode_steps=200,
-            frames=131_072,
+            frames=262_144,
         ),
         SuiteTask(
             "panda-push-human",
@@ -188,18 +195,18 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5, "separation": 2.0},
             _handling(PANDA),
             max_episode_steps=200,
-            frames=131_072,
+            frames=262_144,
         ),
         SuiteTask(
             "panda-pick-in-front",
             PANDA,
             PickAndPlace(),
-            InFront(),
-            _ONE_TOUCH,
-            {"collision": 0.5},
+            InFront(gap=0.12),
+            {"clearance": _CLEARANCE},
+            {"clearance": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
-            frames=131_072,
+            frames=262_144,
         ),
         SuiteTask(
             "ur10-pick-workspace",
@@ -209,22 +216,23 @@ SUITE: dict[str, SuiteTask] = {
             {
                 "workspace": Workspace(Region((0.2, -0.35, 0.0), (0.8, 0.35, 0.45))),
                 "contact-force": ContactForce(),
+                "clearance": _CLEARANCE,
             },
-            {"workspace": 0.5, "contact-force": 0.5},
+            {"workspace": 0.5, "contact-force": 0.5, "clearance": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
-            frames=131_072,
+            frames=262_144,
         ),
         SuiteTask(
             "xarm7-pick-scattered",
             XARM7,
             PickAndPlace(),
-            Scattered(count=3, fewest=1),
+            _IN_THE_WAY,
             _ONE_TOUCH,
             {"collision": 0.5},
             _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
-            frames=131_072,
+            frames=262_144,
         ),
     )
 }
