@@ -214,6 +214,7 @@ def test_short_blocks(tmp_path):
         *code_of("docs/robustness.md"),
         *code_of("docs/limits.md"),
         *code_of("docs/speed.md"),
+        *code_of("docs/howto/demonstrations.md"),
     ]
     script = tmp_path / "blocks.py"
     script.write_text("\n".join([setting, *blocks]), encoding="utf-8")
