@@ -47,7 +47,7 @@ def test_two_costs_and_their_multipliers(tmp_path, capsys):
         evaluate.main(evaluate.Config(file))
     settings = {"env": "experiments.ray_training:make_env", "episodes": 2, "envs": 2}
     evaluate.main(evaluate.Config(file, **settings))
-    assert "Cost limit 0, 40;" in capsys.readouterr().out
+    assert "Cost limits collision 0, speed 40;" in capsys.readouterr().out
 
 
 def test_an_actor_is_killed_on_the_way():
