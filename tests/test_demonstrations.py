@@ -1,5 +1,7 @@
 """A policy that starts from what a pilot would do."""
 
+import shutil
+
 import pytest
 import torch
 from test_resume import assert_same_run
@@ -129,27 +131,41 @@ def test_acting_is_random_and_goes_on():
     env.close()
 
 
-def test_a_run_that_goes_on_is_the_run_that_was_not_stopped(tmp_path):
+SHORT = {
+    **SMALL,
+    "frames": 128,
+    "frames_per_batch": 64,
+    "epochs": 1,
+    "episode_steps": 20,
+    "cost_limit": 0.01,
+    "obstacles": "in-front",
+    "checkpoint_every": 1,
+    "resume": True,
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Results and folder of a run of PPO."""
+    folder = tmp_path_factory.mktemp("whole")
+    return train(Config(**SHORT, out=folder), "ppo", progress=False), folder
+
+
+def test_a_run_that_goes_on_is_the_run_that_was_not_stopped(tmp_path, whole):
     """It does not begin with demonstrations again."""
-    short = {"frames": 128, "frames_per_batch": 64, "epochs": 1, "episode_steps": 20}
-    settings = {**SMALL, **short, "checkpoint_every": 1}
-    whole, part = tmp_path / "whole", tmp_path / "part"
-    expected = train(Config(**settings, out=whole), "ppo", progress=False)
-    train(Config(**settings, out=part), "ppo", progress=False)
+    expected, folder = whole
+    part = shutil.copytree(folder, tmp_path / "part")
     for last in sorted((part / "ppo" / "checkpoints").glob("*.torchrl"))[1:]:
         last.unlink()
-    resumed = train(Config(**settings, out=part, resume=True), "ppo", progress=False)
-    assert_same_run(expected, resumed, whole, part)
+    resumed = train(Config(**SHORT, out=part), "ppo", progress=False)
+    assert_same_run(expected, resumed, folder, part)
 
 
-def test_what_one_algorithm_has_begun_with_the_other_takes(tmp_path, monkeypatch):
-    short = {"frames": 128, "frames_per_batch": 64, "epochs": 1, "episode_steps": 20}
-    settings = {**SMALL, **short, "cost_limit": 0.01, "obstacles": "in-front", "resume": True}
-    both, alone = tmp_path / "both", tmp_path / "alone"
-    expected = train(Config(**settings, out=alone), "ppo-lagrangian", progress=False)
-    train(Config(**settings, out=both), "ppo", progress=False)
+def test_what_one_algorithm_has_begun_with_the_other_takes(tmp_path, whole, monkeypatch):
+    both, alone = shutil.copytree(whole[1], tmp_path / "both"), tmp_path / "alone"
+    expected = train(Config(**SHORT, out=alone), "ppo-lagrangian", progress=False)
     monkeypatch.setattr("experiments.train.start_from_demonstrations", None)
-    taken = train(Config(**settings, out=both), "ppo-lagrangian", progress=False)
+    taken = train(Config(**SHORT, out=both), "ppo-lagrangian", progress=False)
     for log in (both / "logs").rglob("*.csv"):
         if not (alone / log.relative_to(both)).exists():
             log.unlink()
@@ -159,7 +175,13 @@ def test_what_one_algorithm_has_begun_with_the_other_takes(tmp_path, monkeypatch
 @pytest.mark.slow
 def test_workers_collect_with_the_policy_that_was_taught(tmp_path, monkeypatch):
     calm = {"first_log_std": -6.0, "last_log_std": -6.0, "learning_rate": 1e-9}
-    short = {"frames": 64, "frames_per_batch": 64, "epochs": 1, "episode_steps": 20}
+    short = {
+        "frames": 64,
+        "frames_per_batch": 64,
+        "epochs": 1,
+        "episode_steps": 20,
+        "eval_episodes": 4,
+    }
     config = Config(**SMALL, **calm, **short, workers=2, out=tmp_path)
     before = []
     learn = OnPolicyLearner.learn
