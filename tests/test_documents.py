@@ -126,7 +126,7 @@ def test_several_limits(tmp_path):
 def test_an_arm_of_ones_own(tmp_path):
     script = tmp_path / "arm.py"
     script.write_text("\n".join(code_of("docs/howto/arm.md")), encoding="utf-8")
-    home, success = run(script).splitlines()[-2:]
+    home, success = run(script, tmp_path).splitlines()[-2:]
     assert home.replace("-0.0,", "0.0,").replace("-0.0]", "0.0]") == (
         "[0.0, -0.77, -0.26, 0.0, 1.02, 0.0]"
     )
