@@ -90,20 +90,7 @@ class ConstrainedLoss(CostCritic):
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
-        """Returns all outputs but those of the cost critic. A loss of your own overrides it.
-
-        It may call ``self.evaluate(tensordict)``, the present policy, and
-        ``self.unconstrained(tensordict, advantage, policy)``, the outputs of ``ClipPPOLoss`` for
-        any advantage of shape ``(*B, 1)``.
-
-        Args:
-            tensordict (TensorDictBase): the data, a copy that may be written to.
-            advantage (Tensor): reward advantage, shape ``(*B, 1)``.
-            cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
-
-        Returns:
-            A tensordict of losses named ``"loss_..."``, reduced, and of numbers to log.
-        """
+        """See :meth:`~torchrl_safe.objectives.PPOLagrangianLoss.policy_losses`."""
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
