@@ -54,6 +54,14 @@ Condition = Literal[
 ]
 # By how much sizes, motors, masses and friction change.
 _CHANGE = 0.2
+_SCENES: dict[Condition, Scene] = {
+    "weak motors": Scene(motor_strength=1 - _CHANGE),
+    "strong motors": Scene(motor_strength=1 + _CHANGE),
+    "heavy links": Scene(link_mass=1 + _CHANGE),
+    "light links": Scene(link_mass=1 - _CHANGE),
+    "rough": Scene(friction=1 + _CHANGE),
+    "smooth": Scene(friction=1 - _CHANGE),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,25 +198,14 @@ def make_env(
         num_envs: worlds.
         seed: seed of the noise.
     """
-    settings: dict[str, Any] = {"num_envs": num_envs}
+    scene = _SCENES.get(condition, Scene())
+    settings: dict[str, Any] = {"num_envs": num_envs, "scene": scene}
     match condition:
         case "other engine":
             physics = "bullet" if physics == "mujoco" else "mujoco"
         case "wider obstacles":
             wider = Wider(task.obstacles, 1 + _CHANGE)
             task = dataclasses.replace(task, obstacles=wider)
-        case "weak motors":
-            settings["scene"] = Scene(motor_strength=1 - _CHANGE)
-        case "strong motors":
-            settings["scene"] = Scene(motor_strength=1 + _CHANGE)
-        case "heavy links":
-            settings["scene"] = Scene(link_mass=1 + _CHANGE)
-        case "light links":
-            settings["scene"] = Scene(link_mass=1 - _CHANGE)
-        case "rough":
-            settings["scene"] = Scene(friction=1 + _CHANGE)
-        case "smooth":
-            settings["scene"] = Scene(friction=1 - _CHANGE)
         case "heavy object":
             task = scale_object_mass(task, 1 + _CHANGE)
         case "light object":

@@ -46,32 +46,29 @@ def step(env, action):
     return env.step(TensorDict({"action": action.clone()}, batch_size=env.batch_size))["next"]
 
 
+def moved(make_env, **scene):
+    """How far the tool gets from rest in a control step at full action, m."""
+    env = make_env(ArmEnv, obstacles=NoObstacles(), scene=Scene(**scene), seed=0)
+    start = env.reset()["observation"].clone()
+    after = step(env, [[1.0, 0.0, 0.0]])["observation"]
+    return (after - start)[0, env.observation_fields["ee_position"]].norm().item()
+
+
 @pytest.mark.usefixtures("engine")
 def test_weak_motors_are_slower_and_never_stronger_than_their_share(make_env):
-    """From rest at full action: what a motor of a hundredth does is far less."""
-    moved = {}
-    for strength in (0.01, 0.8, 1.0):
-        scene = Scene(motor_strength=strength)
-        env = make_env(ArmEnv, obstacles=NoObstacles(), scene=scene, seed=0)
-        start = env.reset()["observation"].clone()
-        after = step(env, [[1.0, 0.0, 0.0]])["observation"]
-        moved[strength] = (after - start)[0, env.observation_fields["ee_position"]].norm().item()
-    assert moved[0.01] < 0.5 * moved[1.0]
-    assert moved[0.01] < moved[0.8] <= moved[1.0] + 1e-4
+    """What a motor of a hundredth does is far less."""
+    way = {strength: moved(make_env, motor_strength=strength) for strength in (0.01, 0.8, 1.0)}
+    assert way[0.01] < 0.5 * way[1.0]
+    assert way[0.01] < way[0.8] <= way[1.0] + 1e-4
 
 
 @pytest.mark.usefixtures("engine")
 def test_the_same_motors_move_heavy_links_less(make_env):
-    """From rest at full action, without gravity, with motors that are too weak for it."""
-    moved = {}
-    for mass in (0.5, 1.0, 4.0):
-        scene = Scene(gravity=0.0, motor_strength=0.02, link_mass=mass)
-        env = make_env(ArmEnv, obstacles=NoObstacles(), scene=scene, seed=0)
-        start = env.reset()["observation"].clone()
-        after = step(env, [[1.0, 0.0, 0.0]])["observation"]
-        moved[mass] = (after - start)[0, env.observation_fields["ee_position"]].norm().item()
-    assert moved[4.0] < 0.5 * moved[1.0]
-    assert moved[1.0] < moved[0.5]
+    """Without gravity, with motors that are too weak for a full action."""
+    weak = {"gravity": 0.0, "motor_strength": 0.02}
+    way = {mass: moved(make_env, link_mass=mass, **weak) for mass in (0.5, 1.0, 4.0)}
+    assert way[4.0] < 0.5 * way[1.0]
+    assert way[1.0] < way[0.5]
 
 
 @pytest.mark.usefixtures("engine")
