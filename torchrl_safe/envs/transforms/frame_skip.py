@@ -28,7 +28,9 @@ class FrameSkip(FrameSkipTransform):
         >>> from torchrl.envs import TransformedEnv
         >>> from torchrl_safe.envs import ArmEnv
         >>> env = TransformedEnv(ArmEnv(num_envs=2), FrameSkip(4))
-        >>> rollout = env.rollout(20)  # Of 40 steps, which is when the time is up.
+        >>> def rest(td):
+        ...     return td.update(env.full_action_spec.zero())
+        >>> rollout = env.rollout(20, rest)  # The time is up after 40 steps.
         >>> rollout.shape, rollout["next", "truncated"].sum(1).flatten().tolist()
         (torch.Size([2, 10]), [1, 1])
         >>> env.close()
