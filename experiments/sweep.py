@@ -152,7 +152,7 @@ def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
             ppo = mean(episode_costs(_select(runs, action, None)).flatten().unsqueeze(-1))
             axis.axhline(ppo.value.item(), color=colour("ppo"), lw=1.5)
             axis.axhspan(ppo.low.item(), ppo.high.item(), color=colour("ppo"), alpha=0.15, lw=0)
-            axis.set(title=f"{action} actions", xlabel="cost limit")
+            axis.set(title=f"{action.capitalize()} actions", xlabel="cost limit")
             figure.canvas.draw()
             nearest = _select(runs, action, max(config.limits))
             middle = sum(r["evaluation"]["cost/collision"][0] for r in nearest) / len(nearest)
