@@ -1,8 +1,8 @@
 """What a multiplier buys: ``make profile``, return and cost for fixed multipliers.
 
 The Pareto front of return and cost that fixed multipliers trace (as arXiv 2510.17564 recommends to
-show), and where the multiplier rules end for some limits: on the front, if they are any good.
-Stopped and started again, it goes on with the runs that are missing.
+show), and where the multiplier rules end for some limits. Good rules end on the front. To resume
+it, repeat the command: it runs what is missing.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 PPO and constrained PPO with Cartesian (AR1) and joint (AR2) actions, in the paper's environment
 with the paper's settings (those of OpenAI's safety-starter-agents, which the authors' code uses).
-Stopped and started again, it goes on with the runs that are missing.
+To resume it, repeat the command: it runs what is missing.
 """
 
 from __future__ import annotations

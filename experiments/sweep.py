@@ -1,7 +1,7 @@
 """Is the limit kept, whatever it is? ``make sweep``: final cost against cost limit.
 
 Trains PPO-Lagrangian as ``make train`` does, with its defaults, for each limit, action and seed,
-and PPO for comparison. Stopped and started again, it goes on with the runs that are missing.
+and PPO for comparison. To resume it, repeat the command: it runs what is missing.
 """
 
 from __future__ import annotations
