@@ -105,8 +105,8 @@ class Config:
     """Control steps of demonstrations, before the training: a scripted pilot says what to do, and
     the policy learns it."""
     care: Literal["careful", "hurried"] = "careful"
-    """How carefully that pilot acts; a hurried one exceeds limits, so the policy begins with the task
-    learnt and has to learn the limits."""
+    """How carefully that pilot acts; a hurried one exceeds limits, so the policy begins with the
+    task learnt, and has to learn the limits."""
     envs: int = 32
     """Simulated worlds, shared among the workers."""
     workers: int | None = None
