@@ -51,7 +51,7 @@ class SuiteTask:
     Examples:
         >>> task = SUITE["panda-reach-human"]
         >>> dict(task.cost_limits)
-        {'collision': 0.5, 'separation': 0.5}
+        {'collision': 0.5, 'separation': 0.2}
         >>> env = task.make_env(num_envs=2, seed=0)
         >>> env.cost_names, env.max_episode_steps
         (('collision', 'separation'), 60)
@@ -156,14 +156,14 @@ SUITE: dict[str, SuiteTask] = {
             _ONE_TOUCH,
             {"collision": 0.5},
         ),
-        SuiteTask("ur5-reach-moving", UR5, Reach(), Moving(), _ONE_TOUCH, {"collision": 0.5}),
+        SuiteTask("ur5-reach-moving", UR5, Reach(), Moving(), _ONE_TOUCH, {"collision": 0.25}),
         SuiteTask(
             "panda-reach-human",
             PANDA,
             Reach(),
             _BUSY_PERSON,
             _BESIDE_A_PERSON,
-            {"collision": 0.5, "separation": 0.5},
+            {"collision": 0.5, "separation": 0.2},
         ),
         SuiteTask(
             "iiwa-reach-joints",
@@ -171,7 +171,7 @@ SUITE: dict[str, SuiteTask] = {
             Reach(),
             InFront(),
             {"collision": Collision(), "joint-limit": JointLimit(), "speed": Speed(limit=0.75)},
-            {"collision": 0.5, "joint-limit": 0.5, "speed": 1.0},
+            {"collision": 0.25, "joint-limit": 0.5, "speed": 0.5},
             # At 2 rad/s, JointDelta's own, the noise of a policy that explores is itself too fast.
             JointDelta(step=0.05),
         ),
