@@ -51,7 +51,7 @@ class SuiteTask:
     Examples:
         >>> task = SUITE["panda-reach-human"]
         >>> dict(task.cost_limits)
-        {'collision': 0.5, 'separation': 0.2}
+        {'collision': 0.5, 'separation': 0.5}
         >>> env = task.make_env(num_envs=2, seed=0)
         >>> env.cost_names, env.max_episode_steps
         (('collision', 'separation'), 60)
@@ -163,7 +163,7 @@ SUITE: dict[str, SuiteTask] = {
             Reach(),
             _BUSY_PERSON,
             _BESIDE_A_PERSON,
-            {"collision": 0.5, "separation": 0.2},
+            {"collision": 0.5, "separation": 0.5},
         ),
         SuiteTask(
             "iiwa-reach-joints",
