@@ -294,6 +294,7 @@ def test_rotation_vector_takes_the_short_way():
         (lambda: CartesianDelta(step=0), "step must be positive and finite, got 0"),
         (lambda: CartesianDelta(bound=-1), "bound must be positive, got -1"),
         (lambda: JointDelta(bound=10**400), "bound must be positive, got 1000"),
+        (lambda: JointDelta(bound=3e38), "bound must be at most 1.701e\\+38 or infinite, got 3e"),
         (lambda: CartesianDelta(orientation=(0, 0, 0, 0)), "orientation must be a unit quaternion"),
         (lambda: CartesianDelta(orientation=(1, 0, 0)), r"orientation must have shape \(4,\)"),
         (lambda: CartesianDelta(finger_step=0), "finger_step must be positive and finite, got 0"),

@@ -17,16 +17,26 @@ from names import MODULES, public_names  # noqa: E402
 EVERY = [*MODULES, "torchrl_safe.trainers.configs"]
 
 
-def documented():
-    """The names with an entry, by module."""
-    found = {}
+def entries():
+    """Module and name of each entry, once by itself and once with the members that it names."""
     for page in DOCS.glob("reference/*.rst"):
-        module = None
+        module = name = None
         for line in page.read_text(encoding="utf-8").splitlines():
             if match := re.match(r"\.\. currentmodule:: (\S+)", line):
                 module = match[1]
             elif match := re.match(r"\.\. auto(?:class|exception|function|data):: (\S+)", line):
-                found.setdefault(module, []).append(match[1])
+                name = match[1]
+                yield module, name, []
+            elif match := re.match(r"   :members: (.+)", line):
+                yield module, name, match[1].split(", ")
+
+
+def documented():
+    """The names with an entry, by module."""
+    found = {}
+    for module, name, members in entries():
+        if not members:
+            found.setdefault(module, []).append(name)
     return found
 
 
@@ -44,6 +54,15 @@ def test_every_class_and_function_has_a_summary_that_stands_alone(module):
             summary, *rest = inspect.getdoc(member).splitlines()
             assert summary.endswith("."), name
             assert not rest or not rest[0], name
+
+
+def test_every_member_that_a_page_names_has_a_docstring_of_its_own():
+    """Sphinx leaves out the others without a word: ``autodoc_inherit_docstrings`` is off."""
+    named = [(m, n, member) for m, n, members in entries() for member in members]
+    for module, name, member in named:
+        documented_class = getattr(import_module(module), name)
+        assert getattr(documented_class, member).__doc__, f"{name}.{member}"
+    assert len(named) > 40
 
 
 def test_every_page_is_in_the_index():

@@ -123,7 +123,7 @@ def test_what_is_shipped(tmp_path, capsys):
     runs = [
         {"task": task, "algorithm": "ppo-lagrangian", "seed": 7, "evaluation": evaluation}
         for task, evaluation in (
-            (NAME, {**made_up(7, 1.0, 0.1)["evaluation"], "cost/separation": [0.5, 0, 1]}),
+            (NAME, {**made_up(7, 1.0, 0.1)["evaluation"], "cost/separation": [0.1, 0, 1]}),
             ("ur5-reach-moving", made_up(7, 1.0, 0.9)["evaluation"]),
         )
     ]

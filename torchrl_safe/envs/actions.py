@@ -85,8 +85,8 @@ class CartesianDelta:
             per unit of action: 1 opens them by that much, 0 or less closes them.
 
     Raises:
-        ValueError: if ``bound`` or a step is not positive, ``orientation`` is not a unit
-            quaternion, or both yaw and rotation are given.
+        ValueError: if ``bound`` or a step is not positive, a finite ``bound`` is too large for
+            float32, ``orientation`` is not a unit quaternion, or both yaw and rotation are given.
 
     Examples:
         >>> CartesianDelta(step=0.03).width(num_joints=7)
@@ -173,7 +173,8 @@ class JointDelta:
             unit of action: 1 opens them by that much, 0 or less closes them.
 
     Raises:
-        ValueError: if ``step``, ``bound`` or ``finger_step`` is not positive.
+        ValueError: if ``step``, ``bound`` or ``finger_step`` is not positive, or a finite ``bound``
+            is too large for float32.
 
     Examples:
         >>> JointDelta().width(num_joints=7)
@@ -223,3 +224,7 @@ def _check_bound(bound: float) -> None:
         usable = False
     if not usable:
         raise ValueError(f"bound must be positive, got {bound!r}.")
+    # Random actions are drawn from an interval, whose length must be a number of the spec's dtype.
+    largest = float(np.finfo(np.float32).max) / 2
+    if largest < bound < np.inf:
+        raise ValueError(f"bound must be at most {largest:.4g} or infinite, got {bound!r}.")

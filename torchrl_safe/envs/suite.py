@@ -156,7 +156,7 @@ SUITE: dict[str, SuiteTask] = {
             _ONE_TOUCH,
             {"collision": 0.5},
         ),
-        SuiteTask("ur5-reach-moving", UR5, Reach(), Moving(), _ONE_TOUCH, {"collision": 0.5}),
+        SuiteTask("ur5-reach-moving", UR5, Reach(), Moving(), _ONE_TOUCH, {"collision": 0.25}),
         SuiteTask(
             "panda-reach-human",
             PANDA,
@@ -171,7 +171,7 @@ SUITE: dict[str, SuiteTask] = {
             Reach(),
             InFront(),
             {"collision": Collision(), "joint-limit": JointLimit(), "speed": Speed(limit=0.75)},
-            {"collision": 0.5, "joint-limit": 0.5, "speed": 1.0},
+            {"collision": 0.25, "joint-limit": 0.5, "speed": 0.5},
             # At 2 rad/s, JointDelta's own, the noise of a policy that explores is itself too fast.
             JointDelta(step=0.05),
         ),

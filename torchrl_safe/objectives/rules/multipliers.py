@@ -137,6 +137,7 @@ class MultiplierUpdater(CostUpdater):
         """
 
     def state_dict(self) -> dict[str, Any]:
+        """Returns the state of the updater; the multipliers are in the state of the loss."""
         return {
             **super().state_dict(),
             "max_multiplier": self.max_multiplier,
@@ -145,6 +146,13 @@ class MultiplierUpdater(CostUpdater):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Loads a state that :meth:`state_dict` returned, with its limits and options.
+
+        To continue with another limit, set ``cost_limit`` afterwards.
+
+        Raises:
+            ValueError: if the state is of another kind of updater or another number of costs.
+        """
         super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
         self.normalize = state_dict["normalize"]
