@@ -54,7 +54,7 @@ def test_each_is_of_its_task_and_small(name):
     assert card["task"] == name == saved.settings["suite_task"]
     assert card["cost_limits"] == SUITE[name].cost_limits
     file = FOLDER / f"{name}.pt"
-    assert file.stat().st_size < 100_000
+    assert file.stat().st_size < 150_000
     assert saved(np.zeros(saved.observation_shape)).shape == saved.action_shape
     # Nothing of the machine that it was made on.
     assert "out" not in saved.settings
