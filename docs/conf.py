@@ -13,6 +13,7 @@ copyright = "2026, the torchrl-safe authors"
 version = release = installed("torchrl-safe")
 html_theme = "furo"
 html_title = "torchrl-safe"
+pygments_dark_style = "github-dark"  # Furo's own underlines modules.
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 

@@ -37,10 +37,11 @@ class Affine(torch.nn.Module):
 
 
 class Standardize(Affine):
-    """The same, and no further than five deviations from the middle, as is usual.
+    """The same, clipped to five deviations from the mean, as is usual.
 
-    Random actions hardly ever touch an object: of what its velocities become when it is pushed they
-    tell nothing, and a hundred deviations would drown all else that a network sees.
+    Random actions hardly ever touch an object: they say nothing about its velocities when it is
+    pushed. Without the clip, those could be a hundred deviations, and outweigh everything else that
+    a network sees.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -79,8 +80,8 @@ def make_actor(
         env: environment that it acts in.
         loc: what is added to observations, shape ``(observations,)``.
         scale: what they are multiplied by before that, the same.
-        noise: whether the policy's deviation is the same in every state, chosen in each state, or
-            there is none: it then gives the action itself.
+        noise: one deviation for all states, one that the network chooses in each state, or none:
+            the policy then gives the action itself.
         hidden: units in each of its two hidden layers.
         log_std: logarithm of a deviation that is the same in every state.
     """
@@ -108,10 +109,10 @@ def make_actor(
 def make_agent(env: EnvBase, *, gamma: float, hidden: int = 64, log_std: float = 0.0) -> Agent:
     """Makes a policy and two critics of the state, with one output for each cost.
 
-    Observations are standardized by what random actions bring about, and the critics predict
-    the mean of a step, of which the value is ``1 / (1 - gamma)`` times as much: distances of
-    centimetres and values of dozens are both out of reach of a small network that Adam has
-    some hundred batches to train.
+    Observations are standardized by their mean and deviation under random actions. The critics
+    predict the mean of a step, and the value is ``1 / (1 - gamma)`` times that. Otherwise distances
+    of centimetres and values of dozens would be too hard to learn for a small network in some
+    hundred batches.
 
     Args:
         env: environment to read widths from, and to play in.
@@ -140,8 +141,8 @@ def make_q_agent(env: EnvBase, *, gamma: float, stochastic: bool, hidden: int = 
     Args:
         env: see :func:`make_agent`.
         gamma: see :func:`make_agent`.
-        stochastic: whether the policy is a distribution of which it chooses the width in every
-            state, or gives the action itself.
+        stochastic: whether the policy gives a distribution, with a width for each state, or the
+            action itself.
         hidden: see :func:`make_agent`.
     """
     loc, scale = _standardization(env)
@@ -174,9 +175,9 @@ def num_costs(env: EnvBase) -> int:
 
 
 def _standardization(env: EnvBase, *, deviation: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Shift and scale that give what random actions bring about mean 0 and deviation 1.
+    """Shift and scale that bring observations under random actions to mean 0 and deviation 1.
 
-    Actions without bounds are as far from 0 as those of a policy of that deviation.
+    Actions without bounds are drawn with that deviation.
     """
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
@@ -187,7 +188,7 @@ def _standardization(env: EnvBase, *, deviation: float = 1.0) -> tuple[Tensor, T
 
     with torch.no_grad():
         seen = env.rollout(200, act, break_when_any_done=False)["observation"].flatten(0, -2)
-    # What hardly moves in these steps may do so later.
+    # A number that hardly changes in these steps may change later.
     scale = 1 / seen.std(0).clamp_min(0.05)
     return -seen.mean(0) * scale, scale
 

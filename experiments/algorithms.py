@@ -61,7 +61,7 @@ class Training:
         observation_spec: what the policy can read.
         collector: the policy that collects, which may add noise of its own.
         loss: the loss.
-        updater: what tells the loss of the batch's episode costs.
+        updater: tells the loss about the episode costs of a batch.
         learner: what learns from each batch.
     """
 
@@ -106,8 +106,8 @@ def tell_violation(loss: LossModule, config: Config) -> Updater:
 def tell_mean_violation(loss: LossModule, config: Config) -> Updater:
     """The same without pessimism, for losses that act on any violation with all their weight.
 
-    Two standard errors are more than a limit of rare costs: such a loss then keeps the arm away
-    from everything before it has learnt to reach.
+    If costs are rare, two standard errors are more than the limit. Such a loss would then keep the
+    arm away from everything before it has learnt to reach.
     """
     return ViolationUpdater(loss, **_limits(config))
 
@@ -127,8 +127,8 @@ class OnPolicy:
         epochs: passes over a batch, if not those of the configuration.
         method: the step that a trust-region method takes with the actor.
         projects: whether each batch has a second phase, CUP's projection.
-        compiles: whether the loss is compiled in long runs. (Those that ask PyTorch for the
-            divergence of two distributions cannot be, in one graph.)
+        compiles: whether the loss is compiled in long runs. (Losses that ask PyTorch for the
+            divergence of two distributions do not compile to one graph.)
         transforms: called as ``transforms(config)``, what is appended to the environment.
         training_transforms: the same, but not when the policy is evaluated.
         shield: filters the actions, if given.
@@ -231,8 +231,8 @@ class OffPolicy:
 
 
 Algorithm = OnPolicy | OffPolicy
-# No loss of fresh data has target networks, and without the functional form of its networks a
-# gradient step takes an eighth less time.
+# On-policy losses have no target networks, so their networks need no functional form. A gradient
+# step takes an eighth less time without it.
 _OPTIONS: dict[str, Any] = {
     "entropy_bonus": False,
     "loss_critic_type": "l2",
@@ -266,7 +266,7 @@ def _with_budget(config: Config) -> list[Transform]:
 
 
 def _terminating(config: Config) -> list[Transform]:
-    # Worse than any episode, or an early end would be a way out.
+    # Worse than any episode. Otherwise ending early would pay.
     return [EarlyTermination(_budgets(config), termination_reward=-20.0)]
 
 

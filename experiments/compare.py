@@ -1,7 +1,7 @@
 """Every algorithm on the same task: ``make compare``.
 
 Trains each as ``make train`` does, with its defaults and as many control steps, for several seeds.
-Stopped and started again, it goes on with the runs that are missing.
+To resume it, repeat the command: it runs what is missing.
 """
 
 from __future__ import annotations

@@ -11,15 +11,15 @@ from typing import TypeVar
 import torch
 
 Result = TypeVar("Result")
-#: Gradient steps from which compiling saves more time than it takes, even the first time.
+#: From this many gradient steps on, compiling saves more time than it takes, even the first time.
 #: (Inductor keeps what it has compiled: later runs take about a third of that.)
 PAYS_FROM = 10_000
 
 
 def compiled(loss: Callable[..., Result], gradient_steps: int) -> Callable[..., Result]:
-    """Compiles a loss if that pays for as many gradient steps, and can be done here.
+    """Compiles a loss if there are enough gradient steps and a compiler.
 
-    Compiled kernels round in another way than PyTorch's own: the same seed gives another run.
+    Compiled kernels round differently from PyTorch's own, so the same seed gives another run.
 
     Args:
         loss: a function of a minibatch.
@@ -30,11 +30,11 @@ def compiled(loss: Callable[..., Result], gradient_steps: int) -> Callable[..., 
     """
     if gradient_steps < PAYS_FROM:
         return loss
-    # What inductor uses.
+    # The compiler that inductor uses.
     compiler = os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++")
     if shutil.which(compiler) is None:
         print(f"No C++ compiler {compiler} here: the loss is not compiled, and slower.")
         return loss
-    # Of each function only so many graphs are kept: not those of runs before in this process.
+    # PyTorch keeps a limited number of graphs for each function. Drop those of earlier runs.
     torch.compiler.reset()
     return torch.compile(loss, fullgraph=True, dynamic=False)

@@ -88,9 +88,9 @@ class Config:
     """Train in a task of the suite: its arm, obstacles, actions, costs and their limits, with the
     settings that all tasks of its kind have."""
     algorithms: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
-    """What to train; ppo is PPO-Lagrangian with its multiplier fixed at 0, and ppo-shield the same
-    with a filter of its actions that keeps the arm off the obstacles while it learns; with
-    ppo-lagrangian-shield and a limit of the correction, the policy needs no filter later."""
+    """Algorithms to train; ppo is PPO-Lagrangian with its multiplier fixed at 0. ppo-shield is ppo
+    with a shield, which corrects actions so that the arm stays clear of obstacles while it learns.
+    With ppo-lagrangian-shield and a limit on the correction, the policy needs no shield later."""
     shield: bool = False
     """Train ppo-shield as well, and draw the collisions summed over all of training."""
     cost_limit: float = 0.5
@@ -102,11 +102,11 @@ class Config:
     frames: int = 128_000
     """Control steps to train for, with each algorithm."""
     demonstrations: int = 0
-    """Control steps before the training in which a scripted pilot says what to do, and the policy
-    learns to do it."""
+    """Control steps of demonstrations, before the training: a scripted pilot says what to do, and
+    the policy learns it."""
     care: Literal["careful", "hurried"] = "careful"
-    """Whether that pilot keeps well off obstacles, or cuts it close: then the policy does the task
-    to begin with, and has to learn the limits."""
+    """How carefully that pilot acts; a hurried one exceeds limits, so the policy begins with the
+    task learnt, and has to learn the limits."""
     envs: int = 32
     """Simulated worlds, shared among the workers."""
     workers: int | None = None
@@ -122,12 +122,12 @@ class Config:
     )
     """Folder for logs, checkpoints, results.json and pictures; named by date and time."""
     logger: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
-    """TorchRL logger; wandb and mlflow are to be installed by you."""
+    """TorchRL logger; install wandb or mlflow yourself."""
     resume: bool = False
-    """Go on with the run in the folder where it was stopped, with the settings it has; if there
-    is none, begin it."""
+    """Resume the run in the folder, which must have the same settings; without a run there, begin
+    one."""
     checkpoint_every: int = 10
-    """Batches between two checkpoints: what a run that is stopped has to do again at most."""
+    """Batches between two checkpoints: a resumed run repeats at most so many."""
     eval_episodes: int = 256
     """Episodes of the final evaluation, with the deterministic policy."""
     frames_per_batch: int = 1024
@@ -138,10 +138,10 @@ class Config:
     """Control steps in a minibatch."""
     learning_rate: float = 5e-4
     """Adam's learning rate of the policy at the start, half that of the critics; both fall
-    linearly to 0. Off policy all networks have twice as much, and keep it."""
+    linearly to 0. Off policy, all networks have twice that rate throughout."""
     episode_steps: int | None = None
-    """Control steps after which an episode to learn from is cut off, if not at the limit of the
-    environment; evaluations always play to that."""
+    """Control steps after which a training episode is cut off; by default the limit of the
+    environment, to which evaluations always play."""
     hidden: int = 64
     """Units in each of the two hidden layers of every network."""
     first_log_std: float = 0.0
@@ -151,15 +151,14 @@ class Config:
     gamma: float = 0.97
     """Discount of reward and cost."""
     multiplier_rule: MultiplierRule = "pid"
-    """What moves the multiplier: the violations added up and the last one (pid), those added up
-    alone, or nothing."""
+    """What moves the multiplier: the sum of all violations and the last one (pid), the sum alone
+    (dual-ascent), or nothing (fixed)."""
     multiplier_init: float = 0.0
     """Multiplier to start with."""
     multiplier_rate: float = 0.2
     """What a batch far above its limit adds to the multiplier."""
     pessimism: float = 2.0
-    """Standard errors added to the mean cost of a batch before it is compared with the limit; p3o,
-    ipo and crpo do without."""
+    """Standard errors added to the mean cost of a batch; p3o, ipo and crpo do without."""
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "jobs", "eval_episodes", "frames_per_batch")
@@ -277,7 +276,7 @@ class Config:
         return 1 if self.physics == "bullet" else os.cpu_count() or 1
 
 
-# Demonstrations of somebody who does the task and does not keep its limits: those are to be learnt.
+# The demonstrations do the task and do not keep its limits, which are left to learn.
 _HANDLING = {
     "care": "hurried",
     "frames": 262_144,
@@ -306,8 +305,8 @@ TASKS: dict[str, type] = {"reach": Reach, "push": Push, "pick-and-place": PickAn
 # What differs between reaching, pushing and picking up; within a kind of task nothing does.
 KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: _PUSHING, PickAndPlace: _PICKING}
 
-# The wide noise of make train is itself faster than a limit of the suite allows, and nearer to
-# joint limits: multipliers then rise before anything is learnt.
+# The noise of make train alone is faster than a limit of the suite allows, and comes near joint
+# limits. Multipliers would rise before anything is learnt.
 _SUITE_KINDS = {**KINDS, Reach: {**KINDS[Reach], "first_log_std": -1.0}}
 
 

@@ -1,10 +1,10 @@
 """Starts a policy from what a pilot would do, before it learns from rewards.
 
 Random actions hardly ever push a cube to its goal, and never pick one up: there is no reward to
-begin with. So the pilot begins, with noise in its actions, so that it also gets to where it has
-something to mend (DART, Laskey et al. 2017, arXiv 1703.09327). Then the policy acts, and the pilot
-says in every state what it would have done, which is what the policy learns (DAgger, Ross et al.
-2011, arXiv 1011.0686): who only imitates good episodes does not know what to do after a mistake.
+begin with. So the pilot acts first, with noise in its actions, so that it also shows how to recover
+from errors (DART, Laskey et al. 2017, arXiv 1703.09327). Then the policy acts. In every state the
+pilot says what it would have done, and the policy learns that (DAgger, Ross et al. 2011, arXiv
+1011.0686): a policy that only imitates good episodes does not know what to do after a mistake.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from torchrl_safe.envs import ArmEnv
 CARE: dict[str, Care] = {"careful": CAREFUL, "hurried": HURRIED}
 # Share of the control steps in which the pilot acts, and the deviation of its noise.
 _FIRST, _NOISE = 0.25, 0.2
-# Control steps of each world between two times of learning. As many as there are new ones are then
-# drawn so many times from all; in the end, all of them.
+# Control steps of each world before the policy learns again; passes over a sample of that size from
+# all steps so far; and passes over all steps in the end.
 _STEPS, _TIMES, _LAST_TIMES = 32, 50, 40
 # Control steps in a minibatch, and Adam's learning rate, which falls to 0 in the end.
 _SIZE, _RATE = 512, 5e-3
@@ -40,7 +40,7 @@ _LOOKS, _PASSES = 6, 4
 
 
 def start_from_demonstrations(training: Training, env: TransformedEnv, config: Config) -> None:
-    """Teaches the policy what the pilot does, and the critics what comes of it.
+    """Teaches the policy what the pilot does, and the critics what the policy then earns and costs.
 
     Args:
         training: what is to be trained, with an on-policy loss.
@@ -60,8 +60,8 @@ def start_from_demonstrations(training: Training, env: TransformedEnv, config: C
         if index == flown:
             standardize(training.loss, imitation.seen["observation"])
         imitation.learn(_TIMES * new)
-        # Every other time without its noise: it would stop for good where it is undecided, and
-        # with noise it never gets there.
+        # Every other time without noise. There are states in which the policy hesitates and stops
+        # for good, and with noise it never shows them.
         imitation.add(stage.play(_STEPS, training.actor, noise=bool(index % 2)))
     imitation.learn(_LAST_TIMES * rounds * new, settle=True)
     played = Stage(env).play(env.base_env.max_episode_steps, training.actor)

@@ -33,8 +33,7 @@ from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.metrics import conditional_value_at_risk, violation_rate
 from torchrl_safe.policy import Policy, load_policy
 
-# What of a training run's configuration its environment is made of; files of before there was a
-# choice lack some of it.
+# The settings of a training run that make its environment. Older files lack some of them.
 _ENVIRONMENT = (
     *("arm", "task", "obstacles", "action", "observation", "paper"),
     *("cost_limit", "costs", "suite_task", "physics"),

@@ -30,8 +30,8 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 #: From the side and close: tool, obstacle and goal fill the picture.
 CAMERA = Camera(eye=(0.46, -1.0, 0.5), target=(0.46, 0.0, 0.2), field_of_view=42)
-# Pictures of a simulated second, and after how many no other episode begins; with ``fine`` twice
-# as many.
+# Pictures of a simulated second, and the number after which no other episode begins. Twice as many
+# with ``fine``.
 _RATE, _MOST = 40, 80
 # Milliseconds that a picture is shown, and the last one of an episode; the light of a touch stays
 # for some pictures.

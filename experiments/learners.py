@@ -58,8 +58,8 @@ def summed(loss: Callable[[TensorDictBase], TensorDictBase]) -> Objective:
 class NoiseSchedule:
     """Moves the standard deviation of a policy from batch to batch, geometrically.
 
-    If it falls, what is measured while training is, in the end, the policy that is deployed
-    without noise: its cost too, which a constraint is about.
+    If it falls, the policy measured at the end of training is nearly the one that is deployed
+    without noise, and so is its cost.
 
     Args:
         log_std: logarithm of the standard deviation; changed in place.
@@ -134,7 +134,7 @@ class OnPolicyLearner:
             if prepare is not None:
                 prepare()
             for epoch in range(self.epochs):
-                # What was compiled is for the same in all passes: the first checks it.
+                # All passes have the same shapes and modules, so the first checks them for all.
                 with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
                     for minibatch in data[torch.randperm(len(data))].split(self.minibatch):
                         _descend(objective(minibatch), self.optimizer, self.policy)
@@ -202,7 +202,7 @@ def _descend(
     loss: Tensor, optimizer: torch.optim.Optimizer, policy: list[torch.nn.Parameter]
 ) -> None:
     loss.backward()
-    # One step with NaN and all that was learnt is lost: rather none, and an error.
+    # One step with NaN would destroy all that was learnt. Raise an error before it.
     moved = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     gradients = [parameter.grad for parameter in moved if parameter.grad is not None]
     torch.nn.utils.get_total_norm(gradients, error_if_nonfinite=True)

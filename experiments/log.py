@@ -17,10 +17,10 @@ from torchrl.record.loggers import get_logger
 
 
 class Log:
-    """A TorchRL logger that an interrupted run goes on with.
+    """A TorchRL logger for runs that can be resumed.
 
-    What was written after the last checkpoint is written a second time when the run goes on. So
-    the logger's files are begun anew then, with the rows of the checkpoint.
+    A resumed run repeats the batches since its last checkpoint and would log them twice. So it
+    begins the logger's files anew, with the rows of the checkpoint.
 
     Args:
         backend: name of TorchRL's logger.

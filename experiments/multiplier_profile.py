@@ -1,8 +1,8 @@
 """What a multiplier buys: ``make profile``, return and cost for fixed multipliers.
 
 The Pareto front of return and cost that fixed multipliers trace (as arXiv 2510.17564 recommends to
-show), and where the multiplier rules end for some limits: on the front, if they are any good.
-Stopped and started again, it goes on with the runs that are missing.
+show), and where the multiplier rules end for some limits. Good rules end on the front. To resume
+it, repeat the command: it runs what is missing.
 """
 
 from __future__ import annotations
@@ -119,6 +119,7 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
         )
         cost_axis(grid[0, 0], "x", most)
         grid[0, 0].set(xlim=(-0.03, 1.7 * most), ylabel="return")
+        grid[0, 0].margins(y=0.12)  # Room for names.
         for axis, rule in zip_longest(grid[0], rules):
             _draw_front(axis, fixed)
             axis.set(xlabel="cost of an evaluated episode", title=_TITLES.get(rule, ""))
@@ -153,10 +154,12 @@ def _draw_front(axis: Axes, fixed: dict[float, np.ndarray]) -> None:
         axis.plot([rows[:, 1].min(), rows[:, 1].max()], [reward, reward], color=GREY, lw=1)
         axis.plot([cost, cost], [rows[:, 0].min(), rows[:, 0].max()], color=GREY, lw=1)
         axis.plot(cost, reward, "o", color=GREY, ms=5, zorder=2)
+        last = value == max(fixed)
         axis.annotate(
-            f"multiplier fixed at {value:g}" if value == max(fixed) else f"{value:g}",
+            f"multiplier fixed at {value:g}" if last else f"{value:g}",
             (cost, reward),
-            xytext=(5, 5),
+            xytext=(5, 5) if last else (0, 6),
+            rotation=0 if last else 60,  # Costs of small multipliers are close together.
             textcoords="offset points",
             color=GREY,
             fontsize=8,

@@ -2,7 +2,7 @@
 
 PPO and constrained PPO with Cartesian (AR1) and joint (AR2) actions, in the paper's environment
 with the paper's settings (those of OpenAI's safety-starter-agents, which the authors' code uses).
-Stopped and started again, it goes on with the runs that are missing.
+To resume it, repeat the command: it runs what is missing.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ RERUN_SUCCESS = {"AR1 PPO": 0.85, "AR1 cPPO": 0.78, "AR2 PPO": 0.74, "AR2 cPPO":
 # and shorter ones, most early epochs end no episode, and the multiplier hardly leaves its start.)
 _WORLDS = 2
 _LATE = 20
+#: What returns, costs and shares of success cannot leave.
+_BOUNDS = {"return": (-np.inf, np.inf), "cost": (0.0, np.inf), "success": (0.0, 1.0)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,7 +240,8 @@ def table(runs: list[dict[str, Any]]) -> str:
 def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:
     """Draws the paper's Figure 2: mean and standard deviation over seeds.
 
-    A row for each kind of action; success is a share, so its bands end at 0 and 1.
+    A row for each kind of action. Bands end where there is nothing: below a cost of 0, and beyond
+    a success of 0 and 1.
     """
     kinds = dict.fromkeys(cell.partition(" ")[0] for cell in CELLS)
     with figure_style():
@@ -266,7 +269,7 @@ def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:
                         [_smooth(per_epoch(r, name)) for r in runs if r["cell"] == cell]
                     )
                     thousands = np.arange(1, curves.shape[1] + 1)
-                    middle, low, high = band(curves, share=name == "success")
+                    middle, low, high = band(curves, _BOUNDS[name])
                     axis.plot(thousands, middle, color=colour(algorithm))
                     axis.fill_between(
                         thousands, low, high, color=colour(algorithm), alpha=0.15, lw=0
@@ -285,11 +288,10 @@ def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:
         plt.close(figure)
 
 
-def band(curves: np.ndarray, *, share: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean of curves, and a standard deviation below and above; of a share within 0 and 1."""
+def band(curves: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, ...]:
+    """Mean of curves, and a standard deviation below and above, within the bounds."""
     middle, spread = curves.mean(0), curves.std(0)
-    low, high = middle - spread, middle + spread
-    return (middle, low.clip(0, 1), high.clip(0, 1)) if share else (middle, low, high)
+    return middle, (middle - spread).clip(*bounds), (middle + spread).clip(*bounds)
 
 
 def main(config: Config) -> None:

@@ -1,8 +1,8 @@
-"""Policies without learning, to learn from: what to do next in any state that a world may be in.
+"""Scripted policies to learn from, which know what to do next in any state.
 
 A pilot maps the state of all worlds to where each tool is to go next and how far its fingers are to
-be open. It remembers nothing: what it does is a function of the state, which a network can learn,
-and it can tell what is right wherever that network has got to (:mod:`experiments.demonstrations`).
+be open. It has no memory. What it does is a function of the state, so a network can learn it, and
+it can advise that network in any state (:mod:`experiments.demonstrations`).
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ class Care:
         narrower: how much narrower the way round an obstacle is on which an object is pushed, m
             along x, where the hand is wide, and y.
         room: how far off what moves is to be, or the tool goes back, m.
-        time: how far ahead it looks: what comes nearer counts as where it will be then, s.
+        time: how far ahead it looks, s: an obstacle that comes nearer counts as where it will be
+            then.
     """
 
     over: float
@@ -63,7 +64,7 @@ class Care:
 
 #: Keeps the limits of the suite with something to spare.
 CAREFUL = Care(over=0.13, slope=5, aside=0.035, narrower=(0, 0), room=0.11, time=0.5)
-#: Does the task as surely, sooner, and does not keep the limits.
+#: Does the task as reliably and sooner, and does not keep the limits.
 HURRIED = Care(over=0.1, slope=1.5, aside=-0.01, narrower=(0.03, 0.01), room=0.075, time=0.4)
 
 
@@ -78,7 +79,7 @@ def act(env: ArmEnv, pilot: Pilot) -> Array:
     """Returns the actions of a pilot in the present state, ``(N, width)``."""
     target, opening = pilot(env.arm_state)
     mode = env.action_mode
-    assert isinstance(mode, CartesianDelta)  # Or there would be no pilot.
+    assert isinstance(mode, CartesianDelta)  # ``make_pilot`` checks it.
     move = (target - env.arm_state.ee_position) / mode.step
     move *= _SHARE / np.maximum(_SHARE, np.abs(move).max(1, keepdims=True))
     if not mode.moves_fingers:
@@ -122,7 +123,8 @@ class PickAndPlacePilot:
         low = np.column_stack([place[:, :2], np.maximum(_LOW, place[:, 2])])
         pick = _from_above(tool, low, top, self.care)
         put = _from_above(tool, goal, np.maximum(top, goal[:, 2]), self.care)
-        # Who rests on an obstacle gets off it towards the goal: pressing on, it would stay.
+        # A tool that rests on an obstacle leaves it towards the goal. If it pressed on, it would
+        # stay there.
         touches = (state.contact_distance <= 0).any(axis=1, keepdims=True)
         put = np.where(touches, _off(tool, _beside_goal(state, CAREFUL.aside)), put)
         target = np.where(held[:, None], put, pick)
@@ -163,7 +165,7 @@ class PushPilot:
         turn = angle - sign * np.minimum(np.abs(angle), 0.6)
         direction = np.arctan2(-ahead[:, 1], -ahead[:, 0]) - turn
         ring = place[:, :2] + 0.065 * np.column_stack([np.cos(direction), np.sin(direction)])
-        # Pushing where it has gone pushes it back to the line.
+        # Pushing on the side to which the object has strayed brings it back to the line.
         across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
         forward = self.speed * np.clip(1 - np.abs(angle) / 0.6, 0.2, 1)[:, None]
         push = tool[:, :2] + forward * ahead - side[:, None] * across
@@ -200,7 +202,7 @@ class PushPilot:
 def make_pilot(env: ArmEnv, care: Care = CAREFUL) -> Pilot:
     """Makes the pilot of an environment's task.
 
-    What stands, it goes round or over; from what moves, it steps back.
+    It goes round or over obstacles at rest, and steps back from those that move.
 
     Args:
         env: the environment.
@@ -226,7 +228,7 @@ def make_pilot(env: ArmEnv, care: Care = CAREFUL) -> Pilot:
 
 
 def _stepping_back(pilot: Pilot, care: Care) -> Pilot:
-    """The pilot where nothing stands, which gets out of the way of what moves."""
+    """A pilot for moving obstacles only, which gets out of their way."""
 
     def fly(state: ArmState) -> tuple[Array, Array]:
         nothing = np.zeros_like(state.obstacle_present)
@@ -242,7 +244,7 @@ def _stepping_back(pilot: Pilot, care: Care) -> Pilot:
 
 
 def _room(state: ArmState, care: Care) -> tuple[Array, Array]:
-    """How much further off than it is to be all is that moves, m, and the way away from it."""
+    """Room beyond what is required that all moving obstacles leave, m, and the way off them."""
     points = state.ee_position[:, None] + np.array([[0, 0, height] for height in _HAND])
     points = points[:, :, None]
     half = state.obstacle_size[:, 2] - state.obstacle_size[:, 0]
@@ -287,7 +289,7 @@ def _beside_goal(state: ArmState, aside: float) -> Array:
 
 
 def _away(place: Array, state: ArmState) -> Array:
-    """Which way the obstacle nearest to a place is left, unit vectors ``(N, 3)``; 0 without one."""
+    """The direction off the obstacle nearest to a place, ``(N, 3)``; 0 without one."""
     if not state.obstacle_present.shape[1]:
         return np.zeros_like(place)
     off = (place[:, None] - state.obstacle_position) * (1, 1, 0)

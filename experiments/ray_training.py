@@ -41,7 +41,7 @@ from torchrl_safe.policy import save_policy
 
 COSTS: dict[str, Any] = {"collision": Collision(), "speed": Speed(limit=1.0)}
 
-# What an environment raises is another error, and ends the run.
+# An error that an environment raises is not among them, and ends the run.
 _DIED = (ray.exceptions.RayActorError, ray.exceptions.NodeDiedError)
 # More frames than any run takes; -1 means none at all here.
 _ENDLESS = 10**12

@@ -48,7 +48,7 @@ from torchrl_safe.objectives import (
 )
 from torchrl_safe.policy import save_policy
 
-# What may be another when a run is resumed: it changes nothing in what is learnt.
+# Settings that may differ when a run is resumed: they do not change what is learnt.
 CHANGEABLE = ("out", "logger", "resume", "eval_episodes")
 
 
@@ -81,10 +81,10 @@ class Config:
     )
     """Folder for logs, checkpoints, policy.pt and results.json; named by date and time."""
     logger: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
-    """TorchRL logger; all but csv are to be installed by you."""
+    """TorchRL logger; install all but csv yourself."""
     resume: bool = False
-    """Go on with the run in the folder where it was stopped, with the settings it has; if there
-    is none, begin it."""
+    """Resume the run in the folder, which must have the same settings; without a run there, begin
+    one."""
     checkpoint_every: int = 10
     """Batches between two checkpoints. At each, all episodes begin anew."""
     eval_episodes: int = 50
@@ -97,8 +97,8 @@ class Config:
     epochs: int = 20
     """Passes over each batch at most."""
     max_kl: float = 0.02
-    """Divergence from the policy that collected the batch, after which its passes end; the size of
-    the step in a trust region."""
+    """Divergence from the policy that collected the batch at which the passes over it end; in a
+    trust region, the size of the step."""
     minibatch: int = 64
     """Steps in a minibatch."""
     learning_rate: float = 3e-4
@@ -192,7 +192,7 @@ class Critic(torch.nn.Module):
     def change_units(self, targets: Tensor) -> None:
         """Takes mean and deviation of value targets, shape ``(*B, values)``, for units."""
         std, mean = torch.std_mean(targets.flatten(0, -2), 0)
-        # A critic of costs that have become rare is not to magnify its own noise.
+        # Where costs have become rare, a critic must not magnify its own noise.
         std = torch.maximum(std, self.std.lerp(std, 0.02)) if self.changes else std
         std = torch.where(std > 0, std, self.std)
         last, ratio = self.net[-1], self.std / std
@@ -204,13 +204,13 @@ class Critic(torch.nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         values = self.net(self.standardize(observation))
-        # What a squared error in the targets' unit brings back is std ** 2 times too much.
+        # The gradient of a squared error in the targets' unit is std ** 2 times too large.
         values = values.detach().lerp(values, self.std**-2)
         return self.mean + self.std * values
 
 
 class Explorer(torch.nn.Module):
-    """Draws actions from a policy as TanhNormal does; without its object that is twice as fast."""
+    """Draws actions as TanhNormal does, without making one, which is twice as fast."""
 
     def __init__(self, policy: torch.nn.Module, bounds: dict[str, Tensor]) -> None:
         super().__init__()
@@ -292,7 +292,7 @@ def make_env(config: Config) -> EnvBase:
 
 
 def make_collector(config: Config, env: EnvBase, agent: Agent) -> Collector:
-    """Makes what collects a batch after the other, without end."""
+    """Makes the collector, which yields batches without end."""
     return Collector(
         env,
         agent.explorer,
@@ -304,7 +304,7 @@ def make_collector(config: Config, env: EnvBase, agent: Agent) -> Collector:
 
 
 def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | ViolationUpdater | None:
-    """Makes what tells the loss of the episode costs of each batch."""
+    """Makes the updater, which tells the loss about the episode costs of each batch."""
     wanted, limits = ALGORITHMS[config.algorithm].updater, torch.tensor(config.cost_limit)
     if wanted is keep_multiplier:
         return None
@@ -356,7 +356,7 @@ class Learner:
         if self.step is not None:
             self.step.step(data)
         for epoch in range(self.epochs):
-            # What the loss was compiled for is the same in all passes: the first checks it.
+            # All passes have the same shapes and modules, so the first checks them for all.
             with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
                 for minibatch in self._minibatches(data):
                     self._descend(self.objective(minibatch))
@@ -378,7 +378,7 @@ class Learner:
         return kl
 
     def _minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
-        # Each pass leaves out others of the steps that do not fill a minibatch.
+        # The steps that do not fill a minibatch are left out, others in each pass.
         size = self.config.minibatch
         order = torch.randperm(len(data))[: len(data) // size * size]
         yield from data[order].split(size)
@@ -404,7 +404,7 @@ def begin_episodes(config: Config, collector: Collector, frames: int) -> None:
 
 def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     """Trains; returns the networks and the figures of each batch."""
-    torch.set_num_threads(1)  # The networks are small: more only wait for each other.
+    torch.set_num_threads(1)  # The networks are small: more threads would only wait for each other.
     torch.manual_seed(config.seed)
     env = make_env(config)
     env.set_seed(config.seed)

@@ -1,7 +1,7 @@
 """Our PPO-Lagrangian with its defaults against OmniSafe's with its own: ``make safe-gym-grid``.
 
-Same environments, limit and steps, several seeds. Stopped and started again, it goes on with the
-runs that are missing. Needs OmniSafe, which ``make safe-gym-grid`` installs.
+Same environments, limit and steps, several seeds. To resume it, repeat the command: it runs what is
+missing. Needs OmniSafe, which ``make safe-gym-grid`` installs.
 """
 
 from __future__ import annotations

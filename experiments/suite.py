@@ -1,7 +1,7 @@
 """The suite: ten tasks with their limits, every seed, one multiplier rule: ``make suite``.
 
-Trains each task with the settings of its kind (``experiments.config.KINDS``). Stopped and started
-again, it goes on with the runs that are missing.
+Trains each task with the settings of its kind (``experiments.config.KINDS``). To resume it, repeat
+the command: it runs what is missing.
 """
 
 from __future__ import annotations

@@ -257,7 +257,7 @@ def _relative(runs: Sequence[Run], limits: Limits, algorithm: str) -> float:
 
 
 def _interval(statistic: Any, values: torch.Tensor) -> Estimate:
-    """A statistic over all runs; of single seeds there is nothing to draw anew."""
+    """A statistic over all runs; single seeds leave nothing to draw anew."""
     if values.shape[1] == 1:
         values = values.repeat(1, 2)
     return statistic(values.unsqueeze(-1), resample="episodes")

@@ -1,7 +1,7 @@
 """Is the limit kept, whatever it is? ``make sweep``: final cost against cost limit.
 
 Trains PPO-Lagrangian as ``make train`` does, with its defaults, for each limit, action and seed,
-and PPO for comparison. Stopped and started again, it goes on with the runs that are missing.
+and PPO for comparison. To resume it, repeat the command: it runs what is missing.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
             ppo = mean(episode_costs(_select(runs, action, None)).flatten().unsqueeze(-1))
             axis.axhline(ppo.value.item(), color=colour("ppo"), lw=1.5)
             axis.axhspan(ppo.low.item(), ppo.high.item(), color=colour("ppo"), alpha=0.15, lw=0)
-            axis.set(title=f"{action} actions", xlabel="cost limit")
+            axis.set(title=f"{action.capitalize()} actions", xlabel="cost limit")
             figure.canvas.draw()
             nearest = _select(runs, action, max(config.limits))
             middle = sum(r["evaluation"]["cost/collision"][0] for r in nearest) / len(nearest)

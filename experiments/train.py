@@ -101,7 +101,7 @@ COSTS: dict[str, Cost] = {
 }
 # Algorithms that learn the same from demonstrations: they have the same networks, and see the same.
 SHARING: tuple[AlgorithmName, ...] = ("ppo", "ppo-lagrangian")
-# What may be another when a run is resumed: it changes nothing in what is learnt.
+# Settings that may differ when a run is resumed: they do not change what is learnt.
 CHANGEABLE = ("algorithms", "shield", "jobs", "out", "logger", "resume", "checkpoint_every")
 
 
@@ -117,8 +117,9 @@ def make_env(
 ) -> EnvBase:
     """Makes the environment that an algorithm trains in, with sums of reward and cost.
 
-    The sums, over each episode, are of what the arm has earned and cost, whatever an algorithm
-    makes of it. ``shielded=False`` leaves out the shield that an algorithm may have, and its cost.
+    The sums are over each episode, of the arm's own reward and costs, which an algorithm's
+    transforms do not change. ``shielded=False`` leaves out the shield that an algorithm may have,
+    and its cost.
     """
     settings: dict[str, Any] = {
         "observation": OBSERVATIONS[config.observation],
@@ -170,7 +171,7 @@ def make_action(config: Config) -> ActionMode:
     fingers = 0.04 if config.task == "pick-and-place" else None
     if config.action == "joint":
         return JointDelta(finger_step=fingers)
-    # As fast as an arm may reach, 1 m/s, a cube that is hit slides on for 0.2 m.
+    # At the speed of reaching, 1 m/s, a cube that is hit slides on for 0.2 m.
     held = ARMS[config.arm].handling_orientation
     return CartesianDelta(step=0.03, orientation=held, finger_step=fingers)
 
@@ -219,7 +220,7 @@ def train(
     """
     # TorchRL's notes on each buffer would break up the progress bar.
     torchrl_logger.setLevel("WARNING")
-    # The networks are small: more threads than one only wait for each other.
+    # The networks are small: more threads would only wait for each other.
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
     env = make_env(config, num_envs=8, seed=config.seed, algorithm=algorithm)
@@ -233,7 +234,7 @@ def train(
         tqdm(
             total=config.frames,
             desc=algorithm,
-            # Rates and counts would push off the line what one wants to know.
+            # Rates and counts would push the figures off the line.
             bar_format="{desc} {percentage:3.0f} % |{bar:20}| {remaining} left{postfix}",
             disable=not progress,
             position=line,
@@ -294,7 +295,7 @@ def demonstrate(config: Config, algorithm: AlgorithmName, training: Training) ->
 
 
 def begun(config: Config, algorithm: AlgorithmName, training: Training) -> RunCheckpoints:
-    """Where an algorithm keeps what it has begun with, and the state of all generators then."""
+    """The file of what an algorithm has begun with, and of the state of all generators then."""
     depends_on = {"environment": repr(arm_arguments(config)), "care": repr(CARE), **versions()}
     return RunCheckpoints(
         config.out / algorithm / "demonstrations",

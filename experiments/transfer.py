@@ -1,8 +1,8 @@
 """Policies in another world than that of their training: ``python -m experiments.transfer``.
 
 Plays in the other engine, past wider obstacles, with weaker and stronger motors, other masses and
-friction, noisy observations, and actions that come a control step late. Stopped and started again,
-it goes on.
+friction, noisy observations, and actions that come a control step late. To resume it, repeat the
+command.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Tries to make a shielded arm touch something: `make attack ARGS="--steps 1000000"`.
 
 Prints for each arm, action, layout and kind of attack how often it succeeded. A touch is the arm's
-own doing if its closest point was moving towards the obstacle's at that moment. Stopped and started
-again with the same arguments, it goes on with the attacks that are missing.
+own doing if its closest point was moving towards the obstacle's at that moment. To resume it,
+repeat the command: it runs the attacks that are missing.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Policies without learning, which show what a task costs and that it can be done for nothing.
+"""Scripted policies, which show what a task costs, and that it can be done at no cost.
 
 A pilot is a generator for one world: it looks at the environment's state, and yields where the
 tool is to go next, m, and how far the fingers are to open (1) or close (0).
@@ -110,11 +110,11 @@ def carry_low(env, row):
 
 
 def wary(pilot, placements):
-    """What a pilot does, as long as there is a way back from it.
+    """Does what a pilot wants as long as there is a way back from it.
 
-    Before each control step it looks ahead at where the obstacles will be: if it does what it wants
-    to for one more step, can it then get away, up and back or straight back, without coming near
-    one? Else it goes the way that was free a step ago.
+    Before each control step it looks ahead at where the obstacles will be. After one more step of
+    what it wants to do, can it still get away, up and back or straight back, without coming near
+    one? If not, it takes the way that was free a step ago.
 
     Args:
         pilot: where to go.
@@ -219,7 +219,7 @@ def push_in_time(env, row):
 
 
 def push_straight(env, row):
-    """Straight at the goal; where the object is stopped, the tool goes on over it."""
+    """Straight at the goal. If the object is stopped, the tool goes on over it."""
     goal = env.arm_state.goal[row]
     yield from _get_behind(env, row, goal)
     for _ in range(15):
@@ -258,7 +258,7 @@ def _push_to(env, row, stop):
             here, tool = env.arm_state.object_position[row, 0], env.arm_state.ee_position[row]
             forward = _unit(_at_height(stop - here, 0))
             aside = _at_height(here - tool, 0) @ (np.eye(3) - np.outer(forward, forward))
-            # It is pushed back to the line by pushing where it has gone.
+            # Pushing on the side to which it has strayed brings it back to the line.
             yield _at_height(tool + 0.02 * forward + 0.25 * aside, LOW), 0.0
 
 

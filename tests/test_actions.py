@@ -99,7 +99,7 @@ def test_one_step_of_least_squares_lands_near_the_target(panda):
 
 
 def test_damping_and_limits_hold_the_joints_back_near_a_singular_pose(panda):
-    """Undamped, a stretched arm that is told to stretch would turn its joints by radians."""
+    """Without damping, a stretched arm that is to stretch on would turn its joints by radians."""
     state = state_at(panda, np.array([[0.0, 0.0, 0.0, -0.08, 0.0, 0.08, 0.0]]))
     target = state.ee_position + np.array([[0.0, 0.0, 0.05]])
     unbounded = np.full(7, np.inf)
@@ -212,7 +212,7 @@ def test_joint_targets_respect_limits_if_wanted(respect, expected):
 
 
 def test_all_joints_are_slowed_alike_and_worlds_one_by_one(make_env):
-    """So that the tool keeps to its path, whatever the other worlds do."""
+    """So that the tool keeps to its path. The other worlds have no effect."""
     settings = {"action": JointDelta(step=1.0), "obstacles": NoObstacles()}
     both, alone = make_env(ArmEnv, num_envs=2, **settings), make_env(ArmEnv, **settings)
     # World 0 asks for 20 and 10 rad/s, of which 2.175 are to be had; world 1 for 1 rad/s.
@@ -253,7 +253,7 @@ def shares(env, action):
 @pytest.mark.parametrize("action", [CartesianDelta(), JointDelta()], ids=lambda a: type(a).__name__)
 @each_arm
 def test_a_control_step_does_what_was_asked_for(make_env, arm, action):
-    """To within 5 % where efforts and speeds allow, and they allow small actions to every arm."""
+    """To within 5 % where efforts and speeds allow it. They allow every arm small actions."""
     env = make_env(ArmEnv, arm, num_envs=8, action=action, obstacles=NoObstacles(), seed=0)
     generator = torch.manual_seed(0)
     env.reset()
@@ -404,7 +404,7 @@ def test_widths(mode, width):
 
 
 def test_yaw_of_a_tool_that_points_up(make_env):
-    """How far it is turned about the vertical is not defined then, but there is a way back."""
+    """Its turn about the vertical is not defined then, but the next action brings it back."""
     action = CartesianDelta(yaw_step=0.1)
     down = np.array([[1.0, 0.0, 0.0, 0.0]])
     world = SimpleNamespace(home_orientation=down[0])

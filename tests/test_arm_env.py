@@ -243,7 +243,7 @@ def test_partial_reset_leaves_the_other_worlds_alone(make_env):
 
 @both_engines
 def test_the_state_tells_the_time(make_env):
-    """Of each world's own episode, to tasks, costs and observations alike."""
+    """Each world counts its own episode, for tasks, costs and observations alike."""
     seen = {}
     costs = {"step": lambda s: s.step, "seconds": lambda s: s.time}
 
@@ -272,6 +272,24 @@ def test_the_state_tells_the_time(make_env):
     assert other.arm_state.step.tolist() == [1, 4]
     np.testing.assert_allclose(other.arm_state.time, [0.1, 0.4])
     assert np.issubdtype(other.arm_state.step.dtype, np.integer)
+
+
+def test_a_reward_of_a_change_always_has_a_state_before(make_env):
+    """Also in first steps, and when the environment is made, which tries the reward."""
+
+    class Nearer(Reach):
+        def reward(self, state):
+            before, now = (s.goal - s.ee_position for s in (state.previous, state))
+            return np.linalg.norm(before, axis=1) - np.linalg.norm(now, axis=1)
+
+    env = make_env(ArmEnv, task=Nearer(), obstacles=NoObstacles(), num_envs=2, seed=0)
+    env.reset()
+    for _ in range(3):
+        reward = step(env, towards(env, env.arm_state.goal))["reward"]
+        assert ((reward > 0) & (reward < 0.1)).all()
+    env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, batch_size=[2]))
+    reward = step(env, towards(env, env.arm_state.goal))["reward"]
+    assert ((reward > 0) & (reward < 0.1)).all(), "not from where the last episode ended"
 
 
 def test_time_limit_truncates(make_env):
@@ -496,7 +514,7 @@ def test_it_shows_what_it_is_made_of(make_env):
 
 
 def test_closed_environment_says_so(make_env):
-    """Its server's number may belong to another environment by then."""
+    """The number of its server may belong to another environment by then."""
     closed = ArmEnv(seed=0)
     closed.reset()
     closed.close()

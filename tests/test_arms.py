@@ -242,7 +242,7 @@ def test_tool_is_between_the_finger_tips(pose, arm):
 
 
 def test_closed_fingers_are_always_in_contact(pose):
-    """Rounding does not decide it, which a cost of self-contact would count now and then."""
+    """Otherwise rounding would decide now and then whether the arm touches itself."""
     one = pose(UR5)
     one.put(UR5.home)
     points = pybullet.getClosestPoints(one.arm, one.arm, 0, physicsClientId=one.client)

@@ -50,7 +50,7 @@ def build(make_env, transform, num_envs, wrap, outside, num_costs=1):
     if not outside:
         made = partial(inside, transform, num_envs, num_costs)
     env = make_env(made if wrap is None else partial(wrap, made))
-    # Nested as it is, not unwrapped: what is outside then sees the environment as any other.
+    # Nested, not unwrapped: outer parts see it as they see any other environment.
     return TransformedEnv(env, transform(), auto_unwrap=False) if outside else env
 
 
@@ -308,7 +308,7 @@ def test_budgets_are_part_of_the_state():
 
 
 class Choices(EnvBase):
-    """Three steps; an action of 1 pays 1 and costs 1, an action of 0 pays and costs nothing."""
+    """Three steps. An action of 1 earns 1 and costs 1; an action of 0 earns and costs nothing."""
 
     def __init__(self, num_envs):
         super().__init__(batch_size=[num_envs])

@@ -133,7 +133,7 @@ def test_what_cannot_be_used_is_named_and_the_one_before_is_used(run, net, harm,
 
 
 def test_wherever_a_bit_flips_the_one_before_is_used(run, net):
-    """In the archive's own headers too, which every reader stumbles over in another way."""
+    """In the archive's own headers too, where readers fail in many ways."""
     save(run, net, 1)
     second = save(run, net, 2)
     whole = second.read_bytes()
@@ -147,7 +147,7 @@ def test_wherever_a_bit_flips_the_one_before_is_used(run, net):
             second.write_bytes(torn)
             (weight,) = weight_after_load(run, net)
             used.add(weight)
-    # Not every bit of a header matters: then it is the second, whole.
+    # Some bits of a header do not matter. Then the second checkpoint is read, whole.
     assert used <= {1, 2}
     assert 1 in used
 

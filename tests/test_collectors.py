@@ -157,7 +157,7 @@ def test_resuming_a_policy_on_cuda():
 
 @pytest.mark.parametrize("devices", [0, 1, 2, 3])
 def test_generators_of_every_cuda_device_are_saved(devices, monkeypatch):
-    """Here without one: what is asked of torch.cuda, for a state that has seen two devices."""
+    """Without a GPU here: the test checks the calls of torch.cuda for a state of two devices."""
     states = [torch.full((16,), index, dtype=torch.uint8) for index in (1, 2)]
     loaded = []
     collector = resumable()

@@ -79,7 +79,7 @@ def play(env, actions, disturb=()):
     combinations(ARMS, ACTIONS, TASKS, OBSTACLES, ENGINES),
 )
 def test_combination(make_env, arm, action, task, obstacles, physics):
-    """Specs; finite values; a seed is a rollout, bit for bit; resets are worlds' own affairs."""
+    """Specs; finite values; a seed gives one rollout, bit for bit; resets touch no other world."""
     env = make_env(
         ArmEnv,
         ARMS[arm],

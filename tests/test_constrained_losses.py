@@ -89,7 +89,7 @@ class Trunk(nn.Linear):
 
 
 def make_heads(num_costs=2, hidden="hidden"):
-    """A trunk, and actor, critic and cost critic on it as TorchRL's documentation has them."""
+    """A trunk with an actor, a critic and a cost critic on it, as in TorchRL's documentation."""
     torch.manual_seed(0)
     trunk = Trunk(OBSERVATION_SIZE, 8)
     policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
@@ -293,7 +293,7 @@ def test_a_batch_without_advantages_is_treated_like_one_with_them(make, scale):
 
 
 def test_the_objective_does_not_depend_on_the_scale_of_rewards():
-    """Without estimate_advantages it was 1000 times as large, and the cost meant nothing in it."""
+    """Without estimate_advantages it was 1000 times as large, and the cost had no effect."""
     loss = PPOLagrangianLoss(*make_networks(2), num_costs=2, multiplier_init=1.0)
     plain = loss(make_batch(2))["loss_objective"]
     batch = make_batch(2)
@@ -364,7 +364,7 @@ def test_soft_update_finds_the_targets_of_the_wrapped_loss(make):
     names = list(loss.state_dict())
     updater = SoftUpdate(loss, eps=0.5)
     data = loss.estimate_advantages(make_batch()).reshape(-1)
-    loss(data)  # Warns if nobody is said to update the targets: warnings are errors here.
+    loss(data)  # It warns if the targets have no updater, and warnings are errors here.
     before = loss.target_actor_network_params.clone()
     with torch.no_grad():
         for parameter in loss.actor_network_params.values(True, True):

@@ -244,7 +244,7 @@ def of_one_agent(batch, agent):
 @pytest.mark.parametrize("vectorized", [True, False], ids=["vectorized", "loop"])
 @pytest.mark.parametrize("agents", [1, 3, 4])
 def test_agents_that_share_a_done_signal(agents, vectorized):
-    """Each as if alone. With as many agents as rows and steps, done fits along a wrong axis too."""
+    """Each agent as if alone, also where ``done`` would fit along a wrong axis."""
     batch = of_agents(agents=agents)
     got = make_gae(vectorized=vectorized)(batch.clone())
     for agent in range(agents):
@@ -297,7 +297,7 @@ def test_a_signal_that_fits_no_axis_is_refused(key, shape, message):
 
 @pytest.mark.parametrize("num_costs", [1, 2])
 def test_sums_of_several_steps_are_refused(num_costs):
-    """TorchRL's GAE adds them up once more; with several costs it names neither key nor reason."""
+    """TorchRL's GAE adds them up once more, and with several costs its error gives no reason."""
     postproc = MultiStep(gamma=GAMMA, n_steps=2)
     postproc.reward_keys = ("reward", "cost")
     batch = postproc(with_values(num_costs))

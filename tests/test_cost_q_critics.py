@@ -283,7 +283,7 @@ def test_weights_and_masks_act_on_the_cost_critics(kind):
 
 @each_loss
 def test_a_very_large_multiplier_minimizes_its_cost(kind):
-    """Constant but for the bias, two critics: the actor follows the larger prediction."""
+    """Two critics that differ in their bias alone: the actor follows the larger prediction."""
     loss, batch = make_loss(kind, 3), make_transitions(3)
     loss.lagrange_multiplier[1] = 1e8
     call(loss, batch)["loss_actor"].backward()
@@ -542,7 +542,7 @@ def run_with_keys(kind, keys):
 @pytest.mark.parametrize("key", ["action", "priority"])
 @each_loss
 def test_what_is_read_and_written_can_be_renamed(kind, key, name):
-    """All keys can, see test_testing.py; these are seen in the batch."""
+    """test_testing.py renames all keys; these show in the batch."""
     losses, batch = run_with_keys(kind, {key: name})
     expected, _ = run_with_keys(kind, {})
     assert_same_outputs(losses, expected)

@@ -230,7 +230,7 @@ def test_no_block_is_left_out():
 
 
 def test_environments(tmp_path):
-    """Each block runs by itself, and each environment in it is one."""
+    """Each block runs by itself and makes real environments."""
     blocks = code_of("docs/environments.md") + code_of("docs/engines.md")
     assert len(blocks) == 7
     script = tmp_path / "environments.py"
@@ -240,7 +240,7 @@ def test_environments(tmp_path):
 
 
 def test_pages_of_tasks():
-    """Their environments, of which they tell the widths of the observations."""
+    """Their environments have observations of the widths that they name."""
     pages = sorted((ROOT / "docs" / "tasks").glob("*.md"))
     for page in pages:
         (block,) = code_of(page)

@@ -158,7 +158,7 @@ def test_figures_of_a_batch():
 
 
 def test_table_of_hand_made_results():
-    """Shares in percent, means as they are; each under its own heading."""
+    """Shares are in percent, means unchanged, each under its own heading."""
     row = {"success": [0.5, 0.25, 0.75], "cost/hit": [2, 1, 3], "any/hit": [0.125, 0.0, 0.25]}
     results = {
         "cost_limits": {"hit": 0.5},

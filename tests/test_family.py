@@ -152,7 +152,7 @@ def test_ipo_keeps_the_distance_of_its_barrier():
 
 @pytest.mark.parametrize("make", CRPO.values(), ids=CRPO.keys())
 def test_crpo_swings_about_the_limit(make):
-    """It only learns of a violation when it has happened: its mean is a little above the limit."""
+    """It learns of a violation only after it happened: its mean is a little above the limit."""
     shares, _ = train_on_bandit(make, ViolationUpdater, num_batches=50, lr=0.03, read=violation)
     assert shares[-30:].mean().item() == pytest.approx(LIMIT, abs=0.05)
     assert shares[-30:].min() < LIMIT < shares[-30:].max()

@@ -179,7 +179,7 @@ def test_training_whose_worker_is_killed(tmp_path):
         os.kill(workers[-1], signal.SIGKILL)
         _, stderr = run.communicate(timeout=60)
     assert run.returncode == 1
-    # TorchRL's message, or its own stumbling over a worker that takes its time to end.
+    # TorchRL's message, or its error for a worker that takes long to end.
     assert "At least one process failed" in stderr or "Cannot close a process" in stderr
     deadline = time.monotonic() + 30
     while any(Path(f"/proc/{pid}").exists() for pid in workers):
@@ -287,7 +287,7 @@ def with_nan(batch, key):
 
 @pytest.mark.parametrize("key", KEYS, ids=str)
 def test_no_step_is_taken_with_nan(key, batch):
-    """NaN is never swallowed by a mean or a maximum on its way to the gradient."""
+    """No mean or maximum hides a NaN on its way to the gradient."""
     loss, _ = make_loss()
     optimizer = torch.optim.Adam(loss.parameters())
     before = copy_of(loss.parameters())

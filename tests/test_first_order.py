@@ -39,7 +39,7 @@ def crpo(actor, critic, cost_critic, *, num_costs=1, tolerance=0.0, **kwargs):
 # The batch is of another policy, far outside the trust region of FOCOPS.
 near = partial(FOCOPSLoss, kl_bound=1.0)
 LOSSES = {"focops": near, "cup": CUPLoss, "p3o": P3OLoss, "ipo": IPOLoss, "crpo": crpo}
-# As far from their limits as a number can be, so that no method has anything to do.
+# As far below their limits as a number can be, so that no method acts.
 FAR = -1e30
 every_loss = pytest.mark.parametrize("make", LOSSES.values(), ids=LOSSES.keys())
 
@@ -288,7 +288,7 @@ def test_ipo_by_hand():
 
 @pytest.mark.parametrize("kind", [P3OLoss, IPOLoss])
 def test_the_penalty_of_an_unmoved_policy_is_that_of_the_limit_in_every_minibatch(kind):
-    """Costs are at random more or less in a minibatch: the policy has not changed by that."""
+    """Costs of minibatches differ at random, although the policy has not changed."""
     loss = build(kind, 2)
     data = estimated(loss, 2)
     with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
@@ -323,12 +323,12 @@ def test_without_discount_the_length_of_an_episode_must_be_given(kind):
 
 
 def test_the_length_of_an_episode_says_what_a_step_is_worth():
-    """40 steps, discounted by 0.99: 1 - gamma takes them for 100, and the effect for 2.5 times."""
+    """40 steps at gamma 0.99, which stands for 100: the effect is 2.5 times too large."""
     default, true = build(P3OLoss), build(P3OLoss, episode_length=40)
     data = estimated(true)
 
     def effect(loss):
-        """Of the policy's change on the cost of an episode: where the line of the penalty ends."""
+        """The policy's effect on an episode's cost at which the penalty's line ends."""
         penalties = []
         for violation in (4.0, 8.0):
             step(loss, [violation])

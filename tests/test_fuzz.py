@@ -1,4 +1,4 @@
-"""Arguments of all kinds: what is made of them works, or an error names the argument.
+"""Arguments of all kinds: either they work, or an error names the argument.
 
 ``pytest -m slow tests/test_fuzz.py --hypothesis-show-statistics`` tries many more.
 """
@@ -126,7 +126,7 @@ OTHERS = (
 
 @fuzz(calls(*ACTIONS, *TASKS, *LAYOUTS, *COSTS, *OTHERS), few=300, many=50_000)
 def test_parts(call):
-    """What is made can be shown; a layout or task places things, or says which argument hinders."""
+    """What can be made has a repr; a layout or task places things, or names what prevents it."""
     kind, chosen = call
     part = attempt(kind, chosen)
     if part is None:

@@ -155,7 +155,7 @@ def test_same_numbers_as_the_arm(make_env):
 
 
 def test_round_trip_through_torchrl(make_env):
-    """ArmEnv as a Gymnasium environment as a TorchRL environment is ArmEnv again."""
+    """ArmEnv wrapped for Gymnasium and wrapped back for TorchRL behaves like ArmEnv."""
     settings = {"costs": TWO_COSTS, "max_episode_steps": 15}
     direct = make_env(ArmEnv, **settings)
     keys = [("costs", "collision"), ("costs", "one")]
@@ -198,7 +198,7 @@ def test_vectorized_round_trip(make_env, mode):
 
 
 def test_seed_decides_on_everything():
-    """Whatever has been before, and whatever seed the constructor had."""
+    """Whatever happened before, and whatever seed the constructor had."""
     env, other = ArmGymEnv(seed=1), ArmGymEnv()
     first, _ = play(env, seed=7)
     play(env, seed=8)

@@ -69,7 +69,7 @@ def test_the_trainers_need_the_losses_only():
 
 
 def test_the_transforms_need_no_simulator():
-    """PyBullet has no wheel for some Pythons; only who makes an arm is told what is missing."""
+    """PyBullet has no wheel for some Pythons: an error says so, but only when an arm is made."""
     code = (
         "import sys; sys.modules['pybullet'] = None\n"
         "from torchrl_safe.envs import ArmEnv, CostToReward, EarlyTermination, Saute\n"

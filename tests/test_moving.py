@@ -217,7 +217,7 @@ def test_turning_is_a_velocity(make_env):
 
 
 def test_motion_begins_anew_with_the_episode(make_env):
-    """At time 0 of a new draw, and nobody else's clock is touched."""
+    """It begins at time 0 of a new draw, and other worlds keep their time."""
     settings = {"num_envs": 2, "obstacles": Moving(InFront(), Swing(period=0.7)), "seed": 3}
     alone, other = make_env(ArmEnv, **settings), make_env(ArmEnv, **settings)
     noted = [placements(env) for env in (alone, other)]

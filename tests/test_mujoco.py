@@ -1,4 +1,4 @@
-"""What MuJoCo's worlds are of their own: rows of numbers that can be written, saved and shared."""
+"""What only MuJoCo's worlds do: they are rows of numbers that can be written, saved and shared."""
 
 import os
 
@@ -82,7 +82,7 @@ def numbers(state):
 
 @each_episode
 def test_worlds_are_alike_alone_and_among_others(make_env, settings):
-    """Bit for bit: nothing of a world shows in another, on any number of threads."""
+    """Bit for bit: no world affects another, on any number of threads."""
     both = make_env(ArmEnv, num_envs=3, physics=MuJoCo(threads=2), seed=5, **settings)
     both.reset()
     together = play(both, 12)
@@ -174,7 +174,7 @@ def test_checkpoints_of_other_obstacles_are_told(make_env):
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, 1e12])
 def test_a_broken_world_is_named(make_env, tmp_path, monkeypatch, number):
-    """MuJoCo by itself would begin that world anew, and write a file into the working directory."""
+    """MuJoCo alone would reset that world and write a file into the working directory."""
     monkeypatch.chdir(tmp_path)
     env = make_env(ArmEnv, num_envs=3, physics=ONE, obstacles=NoObstacles(), seed=0)
     env.reset()

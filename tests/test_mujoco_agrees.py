@@ -132,7 +132,7 @@ def test_the_tool_moves_alike(make_env, arm):
 
 
 def test_measurements_mean_the_same(make_env):
-    """Of an arm at rest, while a person moves before it: clearance, its changes, and speeds."""
+    """An arm at rest and a person who moves before it: clearance, its changes, and speeds."""
     one, other = make_both(
         make_env, num_envs=4, obstacles=Human(), costs=EVERYTHING, max_episode_steps=1000
     )

@@ -66,7 +66,7 @@ def through_buffer(**kwargs):
 
 
 def test_costs_are_summed_if_they_are_named():
-    """By an attribute of MultiStep, an argument of MultiStepTransform; else the last one stands."""
+    """By an attribute of MultiStep or an argument of MultiStepTransform; else the last is kept."""
     both = ("reward", "cost")
     for summed in (through_postproc(*both), through_buffer(reward_keys=[*both])):
         assert summed["next", "reward"][0, :6, 0].tolist() == THREE

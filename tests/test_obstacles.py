@@ -39,7 +39,7 @@ def test_in_front_of_the_paper():
 
 
 def test_direction_has_no_length():
-    """It only points; and as it does not depend on the start, neither does the room for it."""
+    """It gives a direction only, whatever the start: the room for it depends on the goal alone."""
     layout = InFront(gap=0.2, direction=(0, 5, 0), shape=Cylinder(height=0.3))
     (centre,) = layout.sample(RNG, np.array([0.7, 0, 0.5]), np.array([0.7, 0.1, 0.05])).position
     np.testing.assert_allclose(centre, [0.7, -0.1, 0.15], atol=1e-12)
@@ -165,8 +165,8 @@ def test_scattered_leaves_arm_and_object_free(make_env, task):
 @pytest.mark.parametrize("mass", [0.0, 1.0], ids=["fixed", "free"])
 def test_what_is_absent_is_nowhere(make_env, engine, mass):
     """No contact, no distance, zeros in the observation, and nothing in the picture."""
-    # MuJoCo's solver stops at a tolerance that depends on the inertia of all bodies of a model: of
-    # what stands on the table the last micrometres are others with one body more.
+    # MuJoCo's solver stops at a tolerance that depends on the inertia of all bodies of a model.
+    # With one body more, what stands on the table rests some micrometres elsewhere.
     atol = 2e-5 if engine == "mujoco" and mass else 0
     here = [(0.35, 0.0, 0.2), (0.6, 0.3, 0.1)]
     shape = Cylinder(mass=mass)

@@ -1,4 +1,4 @@
-"""The paper's experiment, made small: what it leaves behind, how it goes on, what it counts."""
+"""The paper's experiment, made small: its files, how it resumes, what it counts."""
 
 import dataclasses
 import json

@@ -116,7 +116,7 @@ def test_mistakes_are_mended(make_env, task):
 
 
 def test_a_pilot_is_a_function_of_the_state(make_env):
-    """It says the same of each world, whatever the others are, and whenever it is asked."""
+    """It gives each world the same advice, whatever the others do, and at any time."""
     arm = ARMS["panda"]
     chosen = {"num_envs": 4, "seed": 0, "physics": MuJoCo(threads=1), **settings(arm, "push")}
     env = make_env(ArmEnv, arm, obstacles=InFront(), **chosen)

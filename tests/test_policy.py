@@ -187,7 +187,7 @@ def test_every_kind_of_actor(make, tmp_path):
 
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_the_actor_of_a_loss(name, tmp_path):
-    """A loss keeps its actor's weights elsewhere: what is saved are those that it trains."""
+    """A loss keeps its actor's weights elsewhere. The file has those that it trains."""
     if name == "ppo":
         loss = ClipPPOLoss(gaussian(), ValueOperator(mlp(1)))
     else:

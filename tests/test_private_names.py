@@ -1,4 +1,4 @@
-"""Which private names of TorchRL the objectives stand on: a new one is named here, or not used.
+"""The private names of TorchRL that the objectives use. To use a new one, add it here.
 
 A private name may move with any release of TorchRL. Those below are each explained where they
 are used; beside them stand two that TorchRL documents for subclasses.

@@ -1,4 +1,4 @@
-"""A run that is stopped at any point and resumed is the run that never was, bit for bit."""
+"""A run that is stopped at any point and resumed equals an uninterrupted run, bit for bit."""
 
 import gc
 import json
@@ -181,7 +181,7 @@ def results(out):
 @pytest.mark.slow
 @pytest.mark.parametrize(("workers", "jobs"), [(1, 1), (2, 1), (1, 2)])
 def test_stopped_again_and_again(tmp_path, workers, jobs, start):
-    """By all signals, in training and after it; what was finished stays, the rest is the same."""
+    """By all signals, in training and after it. Finished parts are kept, the rest is the same."""
     one, two = tmp_path / "one", tmp_path / "two"
     names = ("ppo", "sac-lagrangian")
     process = start(one, *names, workers=workers, jobs=1)

@@ -1,4 +1,4 @@
-"""A state of an environment or a collector that is loaded goes on as the saved one, bit for bit."""
+"""An environment or collector that loads a state continues as the saved one, bit for bit."""
 
 import copy
 from functools import partial
@@ -270,7 +270,7 @@ def two_with_transforms():
 
 @pytest.mark.parametrize("make", [pendulum, two_with_transforms])
 def test_environments_without_a_state_begin_anew(make):
-    """Sums and observations too: not those of an episode that the simulator knows nothing of."""
+    """Sums and observations too, which would otherwise be those of another episode."""
     settings = {**SETTINGS, "frames_per_batch": 10}
 
     def collector():

@@ -32,7 +32,7 @@ def test_a_state_value_is_refused():
 
 
 def test_the_entropy_is_divided_along_with_the_reward():
-    """Worth nothing but for their entropy, actions keep the gradient of 1 / (1 + lambda) of it."""
+    """If entropy is all that actions earn, their gradient is 1 / (1 + lambda) of SAC's."""
     losses, gradients = [], []
     for multiplier in (0.0, 3.0):
         loss = make_loss(SACLagrangianLoss, multiplier_init=multiplier, alpha_init=0.5)

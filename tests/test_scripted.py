@@ -1,6 +1,6 @@
-"""Every task can be done by every arm, past an obstacle in the way, without touching it.
+"""Every arm can do every task, past an obstacle in the way, without touching it.
 
-The thresholds are those of 32 episodes, measured; here are 8 of them, which always go the same.
+The thresholds were measured in 32 episodes. These are 8 of them, which are always the same.
 """
 
 import itertools
@@ -78,7 +78,7 @@ def settings(arm, task):
     ],
 )
 def test_success_costs_nothing(make_env, arm, task):
-    """To who looks where the obstacle is; who does not, touches it."""
+    """For a policy that looks where the obstacle is. One that does not, touches it."""
     careful, careless = PILOTS[task]
     env = make_env(ArmEnv, arm, num_envs=8, seed=0, **settings(arm, task))
     success, _, cost = fly(env, careful)
@@ -99,7 +99,7 @@ FAST = [("panda", "reach", "moving"), ("panda", "reach", "human")]
     ],
 )
 def test_success_costs_nothing_among_what_moves(make_env, engine, arm, task, layout):
-    """To who waits until the way is free, and leaves it in time. It takes longer."""
+    """For a policy that waits until the way is free and leaves it in time. It takes longer."""
     # The xArm 7 has its wrist between cube and obstacle; two of eight do not get behind the cube.
     hard = (engine, arm, task, layout) == ("bullet", XARM7, "push", "moving")
     steps = {"reach": 200, "push": 600, "pick": 400}[task]
@@ -124,9 +124,10 @@ def test_scattered_obstacles_leave_a_way_to_the_goal(make_env, arm):
 def test_fingers_hold_by_friction(make_env, engine, arm):
     """Shaken, a cube stays where it is between the fingers.
 
-    In MuJoCo it creeps: contacts keep to velocities, and what the fingers' way is curved within a
-    substep is lost. That is in proportion to the substep: with 1/240, 1/480 and 1/960 s a UR5 lost
-    7.6, 3.8 and 1.9 mm, with whatever friction. PyBullet's contacts lose a third of it.
+    In MuJoCo it creeps: contacts are solved for velocities, so the curve of the fingers' path
+    within a substep is lost. The loss is in proportion to the substep: with 1/240, 1/480 and 1/960
+    s a UR5 lost 7.6, 3.8 and 1.9 mm, with whatever friction. PyBullet's contacts lose a third of
+    it.
     """
     env = make_env(
         ArmEnv, arm, num_envs=2, obstacles=NoObstacles(), seed=0, **settings(arm, "pick")

@@ -89,7 +89,7 @@ FOLD = {
 
 @pytest.mark.parametrize("name", ARMS)
 def test_folding_into_itself_is_a_touch(make_env, name):
-    """From the first touch on, as long as it goes on: slowly, since what meets fast rebounds."""
+    """From the first touch to the last. The arm moves slowly, since a fast one rebounds."""
     env = make_env(
         ArmEnv,
         ARMS[name],
@@ -284,7 +284,7 @@ def test_speeds_of_every_arm(make_env, arm):
 
 
 def test_a_middle_substep_counts(make_env, turntable):
-    """A cost that is over at the end of the control step, as one that takes the substeps finds."""
+    """A cost that reads substeps finds a violation that is over when the control step ends."""
     costs = {"table": Speed(limit=0.9)}
     turntable["physics"] = Bullet(motor_gain=0.3)
     env = make_env(ArmEnv, **turntable, costs=costs)

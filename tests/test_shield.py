@@ -319,7 +319,7 @@ def test_specs(make_env, engine, obstacles):
 
 
 def test_the_batch_holds_the_sampled_action(make_env, engine):
-    """And its log-probability: what was executed instead is the environment's doing."""
+    """And its log-probability. What is executed instead is up to the environment."""
     env = make_env(ArmEnv, num_envs=2, action=JointDelta(), shield=Shield(), seed=0)
     sampled = []
 

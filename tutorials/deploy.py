@@ -168,7 +168,7 @@ print(f"{late} of 60 steps were late")
 print(f"{reached} targets reached, {touches} steps in contact")
 
 # %%
-# The policy was trained in simulation, in another physics engine even. Keep the limits and the
+# The policy was trained in simulation, and in another physics engine. Keep the limits and the
 # emergency stop of a real arm.
 
 # %%
@@ -208,7 +208,8 @@ class Film:
         self.data = file.getvalue()
 
     def _repr_html_(self):
-        return f'<img src="data:image/gif;base64,{base64.b64encode(self.data).decode()}">'
+        data = base64.b64encode(self.data).decode()
+        return f'<img alt="The arm reaches its target" src="data:image/gif;base64,{data}">'
 
 
 Film(frames, milliseconds=100)

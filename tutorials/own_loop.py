@@ -71,7 +71,7 @@ print(int(ended.sum()), "episodes ended, mean cost", round(episode_cost.mean().i
 # The actor is that of any PPO. Beside the critic of the reward there is one of the costs, with an
 # output for each. Two details make them learn faster. They standardize observations, by
 # the random ones from above: goals differ by centimetres, velocities by metres a second. And the
-# critics predict the mean of a step, of which a value is about ``1 / (1 - GAMMA)`` times as much.
+# critics predict the mean of a step; a value is about ``1 / (1 - GAMMA)`` times as much.
 
 observations = rollout["observation"].flatten(0, 1)
 GAMMA = 0.97
@@ -182,7 +182,7 @@ for key, value in loss(batch.reshape(-1)[:256]).items():
 # The same for every batch, some passes over each. Two lines make it robust. A learning rate that
 # falls to 0 lets the policy settle. The gradient of the policy is clipped, and
 # ``error_if_nonfinite`` stops the run before a NaN is in its weights. Clip the policy alone: the
-# gradients of the critics are larger, and would leave nothing of its own.
+# gradients of the critics are larger, and would take up the whole norm.
 
 optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
 schedule = torch.optim.lr_scheduler.LinearLR(

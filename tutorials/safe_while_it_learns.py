@@ -6,7 +6,7 @@ An agent learns to avoid contact by making contact. On a real arm you cannot aff
 shield between the policy and the motors, train with TorchRL's own PPO, and count collisions:
 
 - Without the shield the arms are in contact for thousands of control steps while they learn.
-- With it they are never in contact, and they learn the task as fast.
+- With it they hardly ever are, and they learn the task a little later.
 
 Both together take about a minute and a half on one core.
 """
@@ -143,7 +143,8 @@ def train(shield=None):
 runs = {"PPO": train(), "PPO with a shield": train(Shield())}
 
 # %%
-# Both learn to reach the target. One of them never touches the obstacle on the way.
+# Both learn to reach the target. With the shield, the arms are hardly ever in contact on the
+# way. `What the shield guarantees <../shield.html#what-it-guarantees>`_ says what is left.
 
 COLOURS = {"PPO": "tab:orange", "PPO with a shield": "tab:green"}
 frames = torch.arange(1, FRAMES // FRAMES_PER_BATCH + 1) * FRAMES_PER_BATCH
@@ -162,7 +163,7 @@ for name, (_, history) in runs.items():
 # Take it away
 # ------------
 #
-# The second policy has learnt with a shield, and leans on it. Without it, it collides.
+# The second policy has learnt to rely on the shield. Without the shield, it collides.
 
 actor = runs["PPO with a shield"][0]
 for name, shield in {"with its shield": Shield(), "without": None}.items():

@@ -229,7 +229,7 @@ class ArmEnv(EnvBase):
             self.action_mode.targets(np.zeros((self.num_envs, width)), state, self._simulator)[0],
             (self.num_envs, joints),
         )
-        self._outcome(state)
+        self._outcome(replace(state, previous=state))  # Rewards may read what has changed.
         fields = self.observation(state)
         check_kind("what observation returns", fields, Mapping)
         if not fields:

@@ -117,7 +117,7 @@ class Proximity:
     TrajOpt (Schulman et al. 2013, Robotics: Science and Systems).
 
     Args:
-        margin: m.
+        margin: distance at which the cost begins, m.
 
     Raises:
         ValueError: if ``margin`` is not positive.

@@ -66,8 +66,8 @@ class Cylinder:
     """A cylinder along its z axis.
 
     Args:
-        radius: m.
-        height: m.
+        radius: its radius, m.
+        height: its height, m.
         mass: kg; 0 fixes it in place, anything else can be pushed and knocked over.
         look: how it is drawn; by default in the colour of obstacles or of objects.
 
@@ -126,7 +126,7 @@ class Sphere:
     """A ball.
 
     Args:
-        radius: m.
+        radius: its radius, m.
         mass: kg; 0 fixes it in place.
         look: how it is drawn; by default in the colour of obstacles or of objects.
 
@@ -157,7 +157,7 @@ class Capsule:
     """A cylinder along its z axis with a half ball at each end.
 
     Args:
-        radius: m.
+        radius: radius of the cylinder and of the half balls, m.
         length: distance between the centres of the half balls, m.
         mass: kg; 0 fixes it in place.
         look: how it is drawn; by default in the colour of obstacles or of objects.

@@ -21,7 +21,7 @@ def rectified_advantage(
     .. math::
         A = \begin{cases}
             A_r & \text{if } J_{c_i} \le d_i + \eta \text{ for all } i \\
-            -A_{c_j} & \text{otherwise, with } j = \arg\max_i (J_{c_i} - d_i)
+            -A_{c_j} & \text{otherwise, with } j = \text{arg}\max_i (J_{c_i} - d_i)
         \end{cases}
 
     (Xu, Liang, Lan 2021, https://arxiv.org/abs/2011.05869, algorithm 1, which leaves open which
