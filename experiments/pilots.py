@@ -35,6 +35,9 @@ _ABOVE_TABLE = 0.12
 _PACE, _SLOWER = 0.027, 0.1
 # What of the hand is to be out of the way: heights above the tool point, and half its width, m.
 _HAND, _HALF_WIDTH = (0.0, 0.1, 0.2), 0.07
+# How high an obstacle is that the hand passes over while the fingers are at the table, and how far
+# from its side the object then keeps, m.
+_UNDER_HAND, _BESIDE = 0.07, 0.08
 # Share of the largest action: a policy that squashes its output can give it.
 _SHARE = 0.9
 
@@ -179,24 +182,34 @@ class PushPilot:
         course = _unit(goal - place)
         if not state.obstacle_present.any():
             return course
-        # In units of the ellipse the obstacle is a circle of radius 1.
-        middle = state.obstacle_position[:, 0, :2]
-        room = np.array(self.room) - self.care.narrower
-        here, there = (place - middle) / room, (goal - middle) / room
+        # In units of the ellipse around it each obstacle is a circle of radius 1.
+        middle, room = state.obstacle_position[..., :2], self._rooms(state)
+        here, there = (place[:, None] - middle) / room, (goal[:, None] - middle) / room
         way = there - here
-        share = np.clip(-(here * way).sum(1) / (way**2).sum(1), 0, 1)[:, None]
+        share = np.clip(-(here * way).sum(-1) / (way**2).sum(-1), 0, 1)[..., None]
         nearest = _length(here + share * way)
         # On the side of the base: to which side of the line from the obstacle the goal is.
-        turn = np.where(there[:, 1] < 0, -1.0, 1.0)[:, None]
-        out, radius = _unit(here), _length(here)[:, None]
-        around = turn * np.column_stack([out[:, 1], -out[:, 0]])
+        turn = np.where(there[..., 1] < 0, -1.0, 1.0)[..., None]
+        out, radius = _unit(here), _length(here)[..., None]
+        around = turn * np.stack([out[..., 1], -out[..., 0]], axis=-1)
         # Along the tangent of the circle, and outwards within it.
         sine = np.minimum(1, 1 / np.maximum(radius, 1e-6))
         tangent = np.sqrt(1 - sine**2) * -out + sine * around
         tangent += np.maximum(0, 1 - radius) * 5 * out
         detour = _unit(tangent * room)
-        blocked = (nearest < np.minimum(0.95, 0.95 * _length(there))) & state.obstacle_present[:, 0]
-        return np.where(blocked[:, None], detour, course)
+        blocked = (nearest < np.minimum(0.95, 0.95 * _length(there))) & state.obstacle_present
+        # Past all of them is where the longest way round leads.
+        cosine = np.where(blocked, (detour * course[:, None]).sum(-1), np.inf)
+        detour = detour[np.arange(len(detour)), cosine.argmin(1)]
+        return np.where(blocked.any(1, keepdims=True), detour, course)
+
+    def _rooms(self, state: ArmState) -> Array:
+        """Half axes of the ellipse around each obstacle that the object stays out of, m."""
+        room = np.array(self.room) - self.care.narrower
+        top = (state.obstacle_position + state.obstacle_size)[..., 2:]
+        # The hand passes over a low one; object and fingers go round it.
+        beside = state.obstacle_size[..., :1] + _BESIDE
+        return np.where(top < _UNDER_HAND, np.minimum(beside, room), room)
 
 
 def make_pilot(env: ArmEnv, care: Care = CAREFUL) -> Pilot:
