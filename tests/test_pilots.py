@@ -1,5 +1,7 @@
 """Pilots do every task, past obstacles without a touch, from whatever state they find."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,8 +11,11 @@ from worlds import ARMS
 from experiments.pilots import CAREFUL, HURRIED, act, make_pilot
 from torchrl_safe.envs import (
     SUITE,
+    UR5,
+    UR10,
     ArmEnv,
     CartesianDelta,
+    Cylinder,
     InFront,
     JointDelta,
     MuJoCo,
@@ -18,6 +23,7 @@ from torchrl_safe.envs import (
     PickAndPlace,
     Push,
     Reach,
+    Region,
     Scattered,
 )
 
@@ -33,10 +39,10 @@ def settings(arm, task):
     return {"task": goal, "action": action, "max_episode_steps": steps}
 
 
-def fly(env, noise=0.0, care=CAREFUL):
+def fly(env, noise=0.0, care=CAREFUL, pilot=None):
     """Plays one episode in each world; returns success and cost of each."""
     env.reset()
-    pilot, generator = make_pilot(env, care), np.random.default_rng(0)
+    pilot, generator = pilot or make_pilot(env, care), np.random.default_rng(0)
     alive, success = np.ones(env.num_envs, bool), np.zeros(env.num_envs, bool)
     cost = np.zeros((env.num_envs, len(env.cost_names)))
     while alive.any():
@@ -64,6 +70,42 @@ def test_success_costs_next_to_nothing(make_env, name, task):
     success, cost = fly(env)
     assert success.all()
     assert cost.mean() <= 0.5
+
+
+def scattered(arm, task):
+    """One or two obstacles where the straight way often leads.
+
+    The hand passes over those beside which an object is pushed. Over those beside which one is
+    picked up it is carried; the forearm of a UR is too low for more than 8 cm.
+    """
+    height = 0.06 if task == "push" else 0.08 if arm in (UR5, UR10) else 0.12
+    (near, *_), (far, *_) = arm.goals.low, arm.goals.high
+    region = Region((near, -0.1, 0), (far, 0.1, 0))
+    return Scattered(2, fewest=1, region=region, shape=Cylinder(0.03, height), clearance=0.1)
+
+
+@pytest.mark.parametrize("task", ["push", "pick"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name == "panda" else pytest.mark.slow) for name in ARMS],
+)
+def test_success_costs_nothing_among_scattered_obstacles(make_env, engine, name, task):
+    """Eight of 32 worlds in which we measured it. Who ignores the obstacles does worse."""
+    arm = ARMS[name]
+    chosen = {"obstacles": scattered(arm, task), "seed": 0, **settings(arm, task)}
+    env = make_env(ArmEnv, arm, num_envs=8, **chosen)
+    success, cost = fly(env)
+    assert success.all()
+    assert not cost.any()
+    careful = make_pilot(env)
+
+    def careless(state):
+        nothing = np.zeros_like(state.obstacle_present)
+        return careful(replace(state, obstacle_present=nothing))
+
+    env.set_seed(0)
+    success, cost = fly(env, pilot=careless)
+    assert (success & ~cost.any(1)).sum() < 8
 
 
 @pytest.mark.parametrize(
