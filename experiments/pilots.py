@@ -37,7 +37,7 @@ _PACE, _SLOWER = 0.027, 0.1
 _HAND, _HALF_WIDTH = (0.0, 0.1, 0.2), 0.07
 # How high an obstacle is that the hand passes over while the fingers are at the table, and how far
 # from its side the object then keeps, m.
-_UNDER_HAND, _BESIDE = 0.07, 0.105
+_UNDER_HAND, _BESIDE = 0.07, 0.11
 # Share of the largest action: a policy that squashes its output can give it.
 _SHARE = 0.9
 
