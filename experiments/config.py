@@ -296,6 +296,7 @@ _PUSHING = {
 # With less noise in the end, the limit is kept too late.
 _PICKING = {
     **_HANDLING,
+    "frames": 393_216,
     "demonstrations": 65_536,
     "first_log_std": -1.2,
     "last_log_std": -2.0,

@@ -206,7 +206,7 @@ SUITE: dict[str, SuiteTask] = {
             {"clearance": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
-            frames=262_144,
+            frames=393_216,
         ),
         SuiteTask(
             "ur10-pick-workspace",
@@ -221,7 +221,7 @@ SUITE: dict[str, SuiteTask] = {
             {"workspace": 0.5, "contact-force": 0.5, "clearance": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
-            frames=262_144,
+            frames=393_216,
         ),
         SuiteTask(
             "xarm7-pick-scattered",
@@ -232,7 +232,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
-            frames=262_144,
+            frames=393_216,
         ),
     )
 }
