@@ -130,7 +130,7 @@ _BUSY_PERSON = Human(shoulder=(1.2, 0.25, 0.4), rest=(1.0, 0.3, 0.2), pause=(0.0
 _PERSON_OPPOSITE = Human(shoulder=(1.25, 0.3, 0.4), rest=(1.0, 0.35, 0.2))
 # Between object and goal: all over the table they are in the way of every tenth episode only.
 _IN_THE_WAY = Scattered(
-    count=3, fewest=1, region=Region((0.42, -0.2, 0), (0.64, 0.2, 0)), clearance=0.1
+    count=2, fewest=1, region=Region((0.42, -0.2, 0), (0.64, 0.2, 0)), clearance=0.1
 )
 
 
