@@ -64,6 +64,10 @@ CostName = Literal[
 MultiplierRule = Literal["pid", "dual-ascent", "fixed"]
 #: The algorithms that learn from replay; they need bounded actions.
 OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
+#: Options that a task of the suite sets.
+SET_BY_SUITE = (
+    *("arm", "task", "obstacles", "action", "observation", "paper", "costs", "cost_limit"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,11 +195,7 @@ class Config:
             if not 0 <= limit < math.inf:
                 raise ValueError(f"costs must have limits of at least 0, got {limit} for {cost}.")
         self._refuse("paper", self.paper, "arm", "task", "obstacles", "physics", "costs")
-        self._refuse(
-            "suite_task",
-            self.suite_task is not None,
-            *("arm", "task", "obstacles", "action", "observation", "paper", "costs", "cost_limit"),
-        )
+        self._refuse("suite_task", self.suite_task is not None, *SET_BY_SUITE)
         self._refuse("costs", bool(self.costs), "cost_limit")
         shielded = {"ppo-shield", "ppo-lagrangian-shield"}
         if self.paper and shielded.intersection(self.chosen):
@@ -296,6 +296,7 @@ _PUSHING = {
 # With less noise in the end, the limit is kept too late.
 _PICKING = {
     **_HANDLING,
+    "frames": 393_216,
     "demonstrations": 65_536,
     "first_log_std": -1.2,
     "last_log_std": -2.0,

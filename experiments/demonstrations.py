@@ -137,8 +137,13 @@ class Imitation:
 
 
 def standardize(loss: LossModule, seen: Tensor) -> None:
-    """Gives what the networks see mean 0 and deviation 1 in the demonstrations."""
-    scale = 1 / seen.std(0).clamp_min(0.02)
+    """Gives what the networks see mean 0 and deviation 1 in the demonstrations.
+
+    The networks do not see what is always the same there, such as an obstacle's size. Its weights
+    would stay random, and another size would change the actions at random.
+    """
+    deviation = seen.std(0)
+    scale = torch.where(deviation > 1e-4, 1 / deviation.clamp_min(0.02), 0)
     for module in loss.modules():
         if isinstance(module, Standardize):
             module.loc.copy_(-seen.mean(0) * scale)

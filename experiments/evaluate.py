@@ -123,7 +123,7 @@ def cost_limits(config: Config, saved: Policy) -> tuple[float, ...]:
     """The limits that are given, or else those of the training."""
     if config.cost_limits:
         return config.cost_limits
-    if "cost_limit" in saved.settings:  # Of make train.
+    if {"cost_limit", "suite_task"} & saved.settings.keys():  # Of make train.
         return tuple(training_config(saved).cost_limits.values())
     return tuple(saved.settings.get("cost_limits", ()))
 

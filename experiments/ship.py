@@ -16,7 +16,7 @@ import tyro
 
 import torchrl_safe
 from experiments import evaluate, suite
-from experiments.config import AlgorithmName
+from experiments.config import SET_BY_SUITE, AlgorithmName
 from experiments.files import write_whole
 from experiments.log import versions
 from experiments.train import CHANGEABLE
@@ -53,9 +53,9 @@ def best(runs: list[dict[str, Any]], limits: dict[str, float]) -> dict[str, Any]
 
 
 def contents(file: Path) -> dict[str, Any]:
-    """What a policy's file holds, without where it was made and what changes nothing in it."""
+    """What a policy's file holds, without where it was made and options that had no effect."""
     found = torch.load(file, map_location="cpu", weights_only=True)
-    unneeded = (*CHANGEABLE, "workers")
+    unneeded = (*CHANGEABLE, *SET_BY_SUITE, "workers")
     settings = found["settings"].items()
     found["settings"] = {name: value for name, value in settings if name not in unneeded}
     return found

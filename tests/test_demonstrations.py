@@ -83,11 +83,14 @@ def test_observations_are_standardized_by_what_was_demonstrated():
         .reshape(-1, env.observation_spec["observation"].shape[-1])
     )
     env.close()
+    # What never changed there is not seen at all when it does.
+    seen[:, 3] = 0.7
     standardize(training.loss, seen)
     for network in (training.actor.module[0].module[0], training.loss.critic_network.module[0]):
         shown = network[0](seen)
         assert shown.mean(0).abs().max() < 0.5
         assert 0.5 < shown.std(0).max() < 1.01
+        assert not network[0](torch.randn_like(seen))[:, 3].any()
 
 
 def test_critics_are_fitted_and_the_policy_stays():

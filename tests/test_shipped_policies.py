@@ -137,7 +137,7 @@ def test_what_is_shipped(tmp_path, capsys):
         f"{NAME}.json",
     }
     saved = load_policy(tmp_path / "policies" / f"{NAME}.pt")
-    assert "out" not in saved.settings
+    assert not {"out", "obstacles", "cost_limit"} & saved.settings.keys()
     assert saved.settings["suite_task"] == NAME
     for weight, own in zip(saved.weights.values(), actor.state_dict().values(), strict=True):
         assert torch.equal(weight, own)

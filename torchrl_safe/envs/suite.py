@@ -130,7 +130,7 @@ _BUSY_PERSON = Human(shoulder=(1.2, 0.25, 0.4), rest=(1.0, 0.3, 0.2), pause=(0.0
 _PERSON_OPPOSITE = Human(shoulder=(1.25, 0.3, 0.4), rest=(1.0, 0.35, 0.2))
 # Between object and goal: all over the table they are in the way of every tenth episode only.
 _IN_THE_WAY = Scattered(
-    count=3, fewest=1, region=Region((0.42, -0.2, 0), (0.64, 0.2, 0)), clearance=0.1
+    count=2, fewest=1, region=Region((0.42, -0.2, 0), (0.64, 0.2, 0)), clearance=0.1
 )
 
 
@@ -206,7 +206,7 @@ SUITE: dict[str, SuiteTask] = {
             {"clearance": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
-            frames=262_144,
+            frames=393_216,
         ),
         SuiteTask(
             "ur10-pick-workspace",
@@ -221,7 +221,7 @@ SUITE: dict[str, SuiteTask] = {
             {"workspace": 0.5, "contact-force": 0.5, "clearance": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
-            frames=262_144,
+            frames=393_216,
         ),
         SuiteTask(
             "xarm7-pick-scattered",
@@ -232,7 +232,7 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
-            frames=262_144,
+            frames=393_216,
         ),
     )
 }
