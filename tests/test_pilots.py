@@ -85,10 +85,15 @@ def scattered(arm, task):
     return Scattered(2, fewest=1, region=region, shape=shape, clearance=0.1, spacing=0.05)
 
 
-@pytest.mark.parametrize("task", ["push", "pick"])
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=() if name == "panda" else pytest.mark.slow) for name in ARMS],
+    ("name", "task"),
+    [
+        pytest.param(
+            name, task, marks=() if (name, task) == ("panda", "push") else pytest.mark.slow
+        )
+        for name in ARMS
+        for task in ("push", "pick")
+    ],
 )
 def test_success_costs_nothing_among_scattered_obstacles(make_env, engine, name, task):
     """For a pilot that looks where they are. One that does not, fails or touches them."""
