@@ -31,18 +31,22 @@ def test_each_task_has_one():
 
 @each_policy
 def test_each_plays_as_its_card_says(name):
-    """64 other episodes are within four standard errors of the 256 of the card."""
+    """64 other episodes are within four standard errors of those of the card.
+
+    Not the mean costs: a rare episode in which the arm stays in contact outweighs all others.
+    """
     card = CARDS[name]
     saved = load_policy(name)
     config = evaluate.Config(Path(name), episodes=64, envs=32, seed=4_000_000)
     env = evaluate.factory(config, saved)(num_envs=32)
     figures = evaluate.play(env, saved, config, tuple(card["cost_limits"].values()))
     env.close()
-    for figure in ("success", *(f"cost/{cost}" for cost in card["cost_limits"])):
+    for figure in ("success", *(f"any/{cost}" for cost in card["cost_limits"])):
         (expected, low, high), found = card[figure], figures[figure][0]
         error = (high - low) / 3.92
-        # Of a quarter of the episodes the error is twice as large.
-        assert abs(found - expected) < 4 * 5**0.5 * error + 0.02, figure
+        # Of fewer episodes the error is larger.
+        both = error * (1 + card["episodes"] / config.episodes) ** 0.5
+        assert abs(found - expected) < 4 * both + 0.02, figure
     for cost, limit in card["cost_limits"].items():
         assert card[f"cost/{cost}"][0] <= limit
 
