@@ -26,7 +26,7 @@ SETTINGS = {
     "workers": 1,
     "epochs": 1,
     "minibatch": 32,
-    "eval_episodes": 32,
+    "eval_episodes": 8,
     "checkpoint_every": 1,
     "gamma": 0.9,
     "multiplier_init": 1.0,
