@@ -452,6 +452,12 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
             bar.set_postfix({name: f"{value:.3g}" for name, value in row.items()})
             log.add({"frames": log.frames + batch.numel(), **row})
             if len(log.rows) % config.checkpoint_every == 0 or len(log.rows) == batches:
+                if all("return" not in row for row in log.rows):
+                    raise ValueError(
+                        f"env must have episodes that end, got none from {config.env!r} in "
+                        f"{len(log.rows)} batches: register it with max_episode_steps, or raise "
+                        "frames_per_batch."
+                    )
                 checkpoints.save(log.frames)
                 begin_episodes(config, collector, log.frames)
     collector.shutdown()

@@ -431,6 +431,8 @@ class Task(Reach):
 
     def sample(self, rng, goals):
         goal, objects = super().sample(rng, goals)
+        if "drawn" in self.values:
+            return self.values["drawn"]
         return self.values.get("goal", goal), objects
 
     def reward(self, state):
@@ -455,6 +457,7 @@ class Task(Reach):
         ({"costs": {}}, "costs must name at least one cost"),
         ({"costs": {"flat": lambda state: 0.0}}, r"cost 'flat' must have shape \(1,\), got \(\)"),
         ({"costs": {"nan": always("nan")}}, "cost 'nan' must be finite"),
+        ({"task": Task(drawn=np.ones(3))}, "sample of the task must return two arrays, the goal and"),
         ({"task": Task(goal=[0.6])}, r"goal must have shape \(3,\), got \(1,\)"),
         ({"task": Task(goal=[0.6, 0, np.nan])}, "goal must be finite"),
         ({"task": Task(reward=0.0)}, r"reward must have shape \(1,\), got \(\)"),
@@ -479,6 +482,7 @@ def test_bad_arguments(arguments, message):
         ({"arm": "panda"}, "arm must be an instance of ArmModel, got 'panda'"),
         ({"action": "cartesian"}, "action must be an instance of ActionMode, got 'cartesian'"),
         ({"task": Reach}, "task must be an instance of Task, got <class"),
+        ({"task": ()}, r"got \(\), which has no objects and no reward and no sample and no success"),
         ({"obstacles": Cylinder()}, "obstacles must be an instance of Obstacles"),
         ({"scene": None}, "scene must be an instance of Scene, got None"),
         ({"physics": Bullet}, "physics must be an instance of Physics, got <class"),

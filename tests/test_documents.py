@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Composite, Unbounded
 from torchrl.modules import MLP
 
-from torchrl_safe.envs import ArmEnv, NoObstacles
+from torchrl_safe.envs import ArmEnv, MuJoCo, NoObstacles
 from torchrl_safe.policy import save_policy
 
 ROOT = Path(__file__).parent.parent
@@ -159,10 +159,10 @@ def test_deploying_a_policy(tmp_path):
     """What docs/howto/deploy.md does with a file, on few episodes."""
     actor = TensorDictModule(MLP(40, 3), ["observation"], ["action"])
     save_policy(tmp_path / "policy.pt", actor, Composite(observation=Unbounded(40)))
-    load, drive, simulated, measure = code_of("docs/howto/deploy.md")
+    load, drive, simulated, batched, measure = code_of("docs/howto/deploy.md")
     short = measure.replace("num_envs=32", "num_envs=2").replace("256", "2")
     assert short != measure
-    show = "print(action.shape, len(figures))\n"
+    show = "print(action.shape, step['action'].shape, len(figures))\n"
     arm = """
 sent, began = [], __import__("time").perf_counter()
 def read_observation(): return np.zeros(40)
@@ -170,12 +170,12 @@ def send_action(action): sent.append(action)
 def is_running(): return len(sent) < 4
 """
     pace = "print(len(sent), 0.15 <= time.perf_counter() - began)\n"
-    code = load + arm + drive + pace + short + show + simulated
+    code = load + arm + drive + pace + simulated + batched + short + show
     (tmp_path / "deploy.py").write_text(code, encoding="utf-8")
     assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-3:] == [
         "4 True",
-        "(3,) 5",
         "reached: True, control steps in collision: 0.0",
+        "(3,) torch.Size([4, 3]) 7",
     ]
 
 
@@ -274,7 +274,7 @@ def test_shield(tmp_path):
 def test_the_circle_is_followed():
     """What howto/task.md shows as a task: going where the target is keeps the tool at it."""
     names = {"__name__": __name__}
-    exec(*code_of("docs/howto/task.md"), names)
+    exec(code_of("docs/howto/task.md")[0], names)
     names["env"].close()
     env = ArmEnv(
         task=names["task"], observation=names["observation"], obstacles=NoObstacles(), seed=0
@@ -296,6 +296,42 @@ def test_the_circle_is_followed():
     # In 4 s once round; behind by what the target does in a control step, 4 mm.
     assert max(misses[20:]) < 0.012
     assert np.unwrap(angles[20:])[-1] - angles[20] == pytest.approx(2 * math.pi * 59 / 80, abs=0.1)
+
+
+def test_two_points_are_touched_in_turn():
+    """The task with a memory in howto/task.md, in worlds that begin anew at different times."""
+    names = {"__name__": __name__}
+    task_alone, with_memory = code_of("docs/howto/task.md")
+    exec(task_alone + "env.close()\n" + with_memory + "env.close()\n", names)
+    task = names["TouchTwo"]()
+    env = ArmEnv(
+        task=task,
+        observation=task.observation,
+        obstacles=NoObstacles(),
+        physics=MuJoCo(),
+        max_episode_steps=60,
+        num_envs=4,
+        seed=0,
+    )
+
+    def straight(tensordict):
+        to_target = tensordict["observation"][..., env.observation_fields["to_target"]]
+        return tensordict.set("action", (to_target / 0.05).clamp(-1, 1))
+
+    played = env.rollout(100, straight, break_when_any_done=False)
+    env.close()
+    done = played["next", "done"].squeeze(-1)
+    assert (played["next", "success"].squeeze(-1) == done).all()  # None runs out of time.
+    assert done.sum(1).min() >= 4
+    touched = played["observation"][..., env.observation_fields["touched"]].squeeze(-1) > 0
+    goal = played["observation"][..., env.observation_fields["to_goal"]].norm(dim=-1)
+    first = torch.nn.functional.pad(done[:, :-1], (1, 0), value=True)
+    assert not touched[first].any()
+    # From where it touches the goal to the end of the episode, and not before.
+    assert ((goal < 0.03) <= touched).all()
+    begins = touched[:, 1:] & ~touched[:, :-1]
+    assert (goal[:, 1:][begins] < 0.03).all()
+    assert (~touched[:, 1:] & touched[:, :-1]).equal(done[:, :-1] & touched[:, :-1])
 
 
 def test_algorithms(tmp_path):

@@ -290,6 +290,9 @@ def test_a_step_without_a_cost_raises(make_env):
     nested = make_env(SafeGymWrapper, Counting(), cost_keys=[("costs", "heat")])
     with pytest.raises(KeyError, match=r"info must have \('costs', 'heat'\) in every step"):
         nested.rollout(1)
+    dotted = make_env(SafeGymWrapper, Counting(), cost_keys=["costs.heat"])
+    with pytest.raises(KeyError, match=r"got only \['cost'.*a tuple: \('costs', 'heat'\)"):
+        dotted.rollout(2)
     no_mapping = make_env(SafeGymWrapper, Counting(), cost_keys=[("cost", "heat")])
     with pytest.raises(KeyError, match=r"info must have \('cost', 'heat'\) in every step"):
         no_mapping.rollout(1)

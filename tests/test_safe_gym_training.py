@@ -267,6 +267,12 @@ def test_settings_that_make_no_sense(changes, message):
         replace(SMALL, **changes)
 
 
+def test_episodes_that_never_end(tmp_path):
+    """A checkpoint after 16 of the 20 steps of an episode begins it anew."""
+    with pytest.raises(ValueError, match="env must have episodes that end, got none from 'sliding"):
+        train(replace(SMALL, frames_per_batch=16, out=tmp_path), progress=False)
+
+
 def test_actions_that_are_not_continuous(tmp_path):
     with pytest.raises(ValueError, match="continuous actions"):
         train(replace(SMALL, env="sliding:Silent-v0", out=tmp_path), progress=False)

@@ -6,7 +6,7 @@ import math
 import operator
 from numbers import Real
 from types import UnionType
-from typing import Any, get_args
+from typing import Any, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,12 @@ def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
     if isinstance(value, type) or not isinstance(value, kind):
         kinds = get_args(kind) or (kind,)
         names = " or ".join(each.__name__ for each in kinds)
-        raise TypeError(f"{name} must be an instance of {names}, got {value!r}.")
+        lacks = ""
+        if Protocol in kinds[0].__mro__ and not isinstance(value, type):
+            members = [member for member in dir(kinds[0]) if not member.startswith("_")]
+            missing = [member for member in members if not hasattr(value, member)]
+            lacks = f", which has no {' and no '.join(missing)}" if missing else ""
+        raise TypeError(f"{name} must be an instance of {names}, got {value!r}{lacks}.")
 
 
 def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -40,8 +40,9 @@ def find_home(
         arm (ArmModel): the arm, with a guess as its ``home``.
         position (sequence of float): the tool point, m, 3 numbers.
         orientation (sequence of float, optional): the tool orientation, a unit quaternion
-            (x, y, z, w). Defaults to ``(1, 0, 0, 0)``, the tool pointing down; ``(0, 1, 0, 0)``
-            does too, turned by half a turn.
+            (x, y, z, w). Defaults to ``(1, 0, 0, 0)``, at which the tool's z axis points down;
+            ``(0, 1, 0, 0)`` does too, turned by half a turn. ``(0, 0.7071, 0, 0.7071)`` points its
+            x axis down, ``(-0.7071, 0, 0, 0.7071)`` its y axis.
 
     Keyword Args:
         physics (Physics, optional): the engine that tells where the tool is. Defaults to
@@ -113,7 +114,10 @@ def _what_stopped(
         )
     if _has_arrived(free):
         beyond = ", ".join(_beyond_limits(simulator, free.angles))
-        return f"a joint limit stopped it: {beyond}. Guess another home."
+        return (
+            f"a joint limit stopped it: {beyond}. Guess another home, or let the tool be turned "
+            "otherwise."
+        )
     values = np.linalg.svd(simulator.jacobian(found.angles[None])[0], compute_uv=False)
     weakest = values.min() if len(values) == 6 else 0.0  # With fewer than six joints.
     if weakest < _SINGULAR:

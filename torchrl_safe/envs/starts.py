@@ -94,9 +94,14 @@ class Starts:
             )
 
     def _draw_task(self, generator: np.random.Generator) -> tuple[Array, Array]:
-        goal, objects = self._task.sample(generator, self._arm.goals)
-        goal = check_array("goal", goal, (3,))
-        return goal, check_array("objects", objects, (len(self._task.objects), 3))
+        drawn = self._task.sample(generator, self._arm.goals)
+        if not isinstance(drawn, tuple) or len(drawn) != 2:
+            raise ValueError(
+                f"sample of the task must return two arrays, the goal and the objects' centres, got "
+                f"{drawn!r}."
+            )
+        goal = check_array("goal", drawn[0], (3,))
+        return goal, check_array("objects", drawn[1], (len(self._task.objects), 3))
 
     def _draw_obstacles(
         self, generator: np.random.Generator, goal: Array, objects: Array

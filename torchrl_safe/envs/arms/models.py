@@ -54,7 +54,8 @@ class ArmModel:
         home: joint angles at the start of an episode, in radians, one for each joint of the
             arm. Cartesian actions keep the tool orientation of this pose.
         goals: box in which the arm reaches every point with the tool turned as at home, in the
-            frame of the arm's base, m.
+            frame of the arm's base, m. Defaults to the Panda's: x from 0.6 to 0.7, y from -0.2 to
+            0.2, z from 0.05 to 0.15.
         finger_home: position of free finger joints at the start of an episode, m.
         gripper: what is mounted on ``ee_link``; its ``tool_link`` then is the tool point.
         handling_orientation: tool orientation, a quaternion (x, y, z, w), that keeps the arm off

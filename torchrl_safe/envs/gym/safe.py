@@ -178,7 +178,10 @@ def _look_up(info: Any, path: tuple[str, ...]) -> Any:
     for name in path:
         known = autoreset.entries(entry)
         if name not in known:
-            raise KeyError(f"info must have {path} in every step, got only {[*info]}.")
+            # Without Gymnasium's masks of the environments that have an entry.
+            names = [key for key in info if f"{key}"[:1] != "_" or f"{key}"[1:] not in info]
+            hint = f" An entry of an entry is a tuple: {(*name.split('.'),)}." if "." in name else ""
+            raise KeyError(f"info must have {path} in every step, got only {names}.{hint}")
         entry, present = known[name], known.get(f"_{name}", True)
     # Gymnasium's mask of the environments that have the entry, if the info is of several.
     if isinstance(present, np.ndarray) and not present.all():
