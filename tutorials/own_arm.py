@@ -144,7 +144,7 @@ for orientation in ((1, 0, 0, 0), (0, 1, 0, 0)):
 #
 # ``goals`` is a box that the tool can reach while it points down. Begin at least 0.2 m beyond the
 # home position, so that an obstacle fits between. ``ArmEnv`` draws goals from the box, and raises
-# an error if one is out of reach.
+# an error if one is out of reach however the tool is turned.
 
 arm = replace(guess, home=home, goals=Region(low=(0.55, -0.2, 0.05), high=(0.62, 0.2, 0.15)))
 

@@ -95,10 +95,10 @@ class Starts:
 
     def _draw_task(self, generator: np.random.Generator) -> tuple[Array, Array]:
         drawn = self._task.sample(generator, self._arm.goals)
-        if not isinstance(drawn, tuple) or len(drawn) != 2:
+        if not isinstance(drawn, tuple | list) or len(drawn) != 2:
             raise ValueError(
-                f"sample of the task must return two arrays, the goal and the objects' centres, got "
-                f"{drawn!r}."
+                "sample of the task must return two arrays, the goal and the objects' centres, "
+                f"got {drawn!r}."
             )
         goal = check_array("goal", drawn[0], (3,))
         return goal, check_array("objects", drawn[1], (len(self._task.objects), 3))

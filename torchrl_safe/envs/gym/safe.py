@@ -180,7 +180,8 @@ def _look_up(info: Any, path: tuple[str, ...]) -> Any:
         if name not in known:
             # Without Gymnasium's masks of the environments that have an entry.
             names = [key for key in info if f"{key}"[:1] != "_" or f"{key}"[1:] not in info]
-            hint = f" An entry of an entry is a tuple: {(*name.split('.'),)}." if "." in name else ""
+            nested = tuple(name.split("."))
+            hint = f" An entry of an entry is a tuple: {nested}." if len(nested) > 1 else ""
             raise KeyError(f"info must have {path} in every step, got only {names}.{hint}")
         entry, present = known[name], known.get(f"_{name}", True)
     # Gymnasium's mask of the environments that have the entry, if the info is of several.
