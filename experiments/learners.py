@@ -73,7 +73,9 @@ class NoiseSchedule:
 
     def step(self) -> None:
         self.steps += 1
-        self.log_std.copy_(self.first.lerp(torch.tensor(self.last), self.steps / self.batches))
+        self.log_std.copy_(
+            self.first.lerp(self.first.new_tensor(self.last), self.steps / self.batches)
+        )
 
     def state_dict(self) -> dict[str, Any]:
         return {"first": self.first, "steps": self.steps}
@@ -128,6 +130,9 @@ class OnPolicyLearner:
     def learn(self, batch: TensorDictBase) -> None:
         data = self.loss.estimate_advantages(batch).reshape(-1)
         if self.actor_step is not None:
+            # What a limit, of an episode, is in the unit of the step's surrogates.
+            ended = int(batch["next", "done"].sum())
+            self.actor_step.episode_length = batch.numel() / max(ended, 1)
             self.actor_step.step(data)
         data = data.exclude(*NOT_LEARNT_FROM)
         for prepare, objective in self.phases:

@@ -25,7 +25,7 @@ from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
-from experiments.algorithms import ALGORITHMS, Training
+from experiments.algorithms import ALGORITHMS, Training, configured
 from experiments.config import AlgorithmName, Config, command_line
 from experiments.demonstrations import CARE, start_from_demonstrations
 from experiments.files import is_new, write_whole
@@ -216,8 +216,10 @@ def train(
 ) -> tuple[TensorDictModuleBase, Log]:
     """Trains with one algorithm; returns the policy and the figures of each batch.
 
-    ``line`` is where the progress is shown, below the first.
+    ``line`` is where the progress is shown, below the first. Where the configuration has defaults,
+    the algorithm's own settings take their place.
     """
+    config = configured(config, algorithm)
     # TorchRL's notes on each buffer would break up the progress bar.
     torchrl_logger.setLevel("WARNING")
     # The networks are small: more threads would only wait for each other.

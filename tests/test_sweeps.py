@@ -39,8 +39,9 @@ def test_sweep_leaves_table_figure_and_results(swept):
 
 @pytest.mark.parametrize("script", [compare, sweep, multiplier_profile])
 def test_engine_is_an_option(script, tmp_path):
-    jobs = script.jobs(script.Config(physics="mujoco", out=tmp_path))
-    assert {settings.physics for settings, _ in jobs.values()} == {"mujoco"}
+    for physics in ("bullet", "mujoco"):
+        jobs = script.jobs(script.Config(physics=physics, out=tmp_path))
+        assert {settings.physics for settings, _ in jobs.values()} == {physics}
 
 
 def test_the_paper_has_one_engine(tmp_path):
@@ -109,10 +110,11 @@ def test_profile_shows_fixed_multipliers_and_rules(tmp_path):
 
 
 def test_comparison_has_a_row_for_each_algorithm(tmp_path):
-    def end(algorithm, seed, costs, success):
+    def end(algorithm, seed, costs, success, limit=0.5):
         return {
             "algorithm": algorithm,
             "seed": seed,
+            "cost_limit": limit,
             "seconds": 60.0 * (1 + seed),
             "evaluation": {
                 "success": [success, 0, 1], "return": [-2.0 - seed], "cost/collision": [costs[0]],
@@ -123,15 +125,28 @@ def test_comparison_has_a_row_for_each_algorithm(tmp_path):
     runs = [
         end("ppo", 0, [4, 4], 1.0), end("cpo", 0, [0, 1], 1.0),
         end("ppo", 1, [6, 6], 1.0), end("cpo", 1, [1, 1], 0.5),
+        end("ppo-saute", 0, [1, 2], 1.0, limit=2.0), end("ppo-saute", 1, [2, 2], 1.0, limit=2.0),
     ]  # fmt: skip
-    rows = compare.table(runs, cost_limit=0.5).splitlines()[2:]
+    rows = compare.table(runs).splitlines()[2:]
     assert rows == [
-        "| ppo | 5.00 [4.00, 6.00] | 6.00 | 0/2 | 100.0% | 100.0% | -2.50 | 1.5 |",
-        "| cpo | 0.75 [0.50, 1.00] | 1.00 | 1/2 | 75.0% | 50.0% | -2.50 | 1.5 |",
+        "| ppo | 0.5 | 5.00 [4.00, 6.00] | 6.00 | 0/2 | 100.0% | 100.0% | -2.50 | 1.5 |",
+        "| cpo | 0.5 | 0.75 [0.50, 1.00] | 1.00 | 1/2 | 75.0% | 50.0% | -2.50 | 1.5 |",
+        "| ppo-saute | 2 | 1.75 [1.50, 2.00] | 2.00 | 2/2 | 100.0% | 100.0% | -2.50 | 1.5 |",
     ]
-    compare.plot(runs, 0.5, tmp_path / "compare.png")
+    compare.plot(runs, tmp_path / "compare.png")
     with Image.open(tmp_path / "compare.png") as image:
         assert image.width > 500
+
+
+def test_comparison_has_settings_and_limits_of_their_own_for_some(tmp_path):
+    jobs = compare.jobs(compare.Config(seeds=1, out=tmp_path))
+    settings = {algorithm: config for config, algorithm in jobs.values()}
+    assert len(settings) == 17
+    assert settings["ppo"].frames == settings["ppo-lagrangian"].frames == 128_000
+    assert settings["a2c-lagrangian"].frames_per_batch == 256
+    assert {n for n, c in settings.items() if c.cost_limit == 2} == {*compare.BUDGETS}
+    higher = compare.jobs(compare.Config(seeds=1, cost_limit=5.0, out=tmp_path))
+    assert {config.cost_limit for config, _ in higher.values()} == {5.0}
 
 
 @pytest.mark.slow

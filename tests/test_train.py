@@ -16,7 +16,7 @@ from torchrl.checkpoint import Checkpoint
 
 import experiments.train
 from experiments.agent import make_agent
-from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES, OffPolicy
+from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES, OffPolicy, configured
 from experiments.config import OFF_POLICY, AlgorithmName, Config, command_line
 from experiments.film import save_film
 from experiments.learners import NoiseSchedule
@@ -258,6 +258,15 @@ def test_every_algorithm_has_a_name():
     assert replaying == set(OFF_POLICY)
 
 
+def test_an_algorithm_has_its_own_settings_where_none_are_given():
+    own = configured(Config(), "a2c-lagrangian")
+    assert (own.frames, own.frames_per_batch, own.learning_rate) == (512_000, 256, 2e-3)
+    asked = configured(Config(frames=1024, learning_rate=1e-4), "a2c-lagrangian")
+    assert (asked.frames, asked.frames_per_batch, asked.learning_rate) == (1024, 256, 1e-4)
+    config = Config()
+    assert configured(config, "ppo") == configured(config, "ppo-lagrangian") == config
+
+
 # One of each kind for `make test`. That they learn is tested on a problem of known optimum.
 @pytest.mark.parametrize(
     "algorithm",
@@ -331,6 +340,19 @@ def test_each_epoch_sees_each_step_once():
     assert len(set(steps)) == 10
     assert all(sorted(epoch) == sorted(steps) for epoch in epochs)
     assert epochs[0] != epochs[1] != epochs[2]
+
+
+@pytest.mark.parametrize(("ended", "length"), [(1, 10.0), (2, 5.0)])
+def test_a_trust_region_step_knows_how_long_episodes_are(ended, length):
+    # Two worlds of five steps each; one or both end an episode with the last.
+    training = make_training("cpo", epochs=1)
+    config = Config(envs=2, frames_per_batch=10, workers=1)
+    with collecting(config, training.collector, "cpo") as collector:
+        batch = next(iter(collector)).clone()
+    batch["next", "done"].zero_()
+    batch["next", "done"][:ended, -1] = True
+    training.learner.learn(batch)
+    assert training.learner.actor_step.episode_length == length
 
 
 def test_a_fixed_multiplier_stays():

@@ -66,7 +66,7 @@ class SuiteTask:
     cost_limits: Mapping[str, float]
     action: ActionMode = CartesianDelta()
     max_episode_steps: int = 60
-    frames: int = 128_000
+    frames: int = 393_216
 
     def __post_init__(self) -> None:
         words = self.name.split("-") if isinstance(self.name, str) else []
@@ -206,7 +206,6 @@ SUITE: dict[str, SuiteTask] = {
             {"clearance": 0.5},
             _handling(PANDA, finger_step=0.04),
             max_episode_steps=100,
-            frames=393_216,
         ),
         SuiteTask(
             "ur10-pick-workspace",
@@ -221,7 +220,6 @@ SUITE: dict[str, SuiteTask] = {
             {"workspace": 0.5, "contact-force": 0.5, "clearance": 0.5},
             _handling(UR10, finger_step=0.04),
             max_episode_steps=100,
-            frames=393_216,
         ),
         SuiteTask(
             "xarm7-pick-scattered",
@@ -232,7 +230,6 @@ SUITE: dict[str, SuiteTask] = {
             {"collision": 0.5},
             _handling(XARM7, finger_step=0.04),
             max_episode_steps=100,
-            frames=393_216,
         ),
     )
 }
