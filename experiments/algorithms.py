@@ -281,9 +281,9 @@ def _terminating(config: Config) -> list[Transform]:
 _A2C = {
     "frames": 512_000,
     "frames_per_batch": 256,
-    "learning_rate": 2e-3,
+    "learning_rate": 1e-3,
     "first_log_std": -1.0,
-    "multiplier_rate": 0.05,
+    "multiplier_rate": 0.0125,
 }
 ALGORITHMS: dict[AlgorithmName, Algorithm] = {
     "ppo": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, compiles=True),
