@@ -98,22 +98,15 @@ def move_multiplier(loss: LossModule, config: Config) -> Updater | None:
     )
 
 
-def tell_violation(loss: LossModule, config: Config) -> Updater:
-    """No multiplier: the loss reads the violation itself, with twice the pessimism.
+def tell_violation(loss: LossModule, config: Config, *, errors: float) -> Updater:
+    """No multiplier: the loss reads the violation itself, with so many times the pessimism.
 
     A multiplier sums up the violations of many batches. A trust-region step knows one, and goes
-    only as far as the region lets it.
+    only as far as the region lets it: it takes twice the pessimism. Losses that act on any
+    violation with all their weight take less. Where costs are rare, two standard errors are more
+    than the limit, and the arm would keep away from everything before it has learnt to reach.
     """
-    return ViolationUpdater(loss, **_limits(config), pessimism=2 * config.pessimism)
-
-
-def tell_mean_violation(loss: LossModule, config: Config) -> Updater:
-    """The same without pessimism, for losses that act on any violation with all their weight.
-
-    If costs are rare, two standard errors are more than the limit. Such a loss would then keep the
-    arm away from everything before it has learnt to reach.
-    """
-    return ViolationUpdater(loss, **_limits(config))
+    return ViolationUpdater(loss, **_limits(config), pessimism=errors * config.pessimism)
 
 
 def no_transforms(config: Config) -> list[Transform]:
@@ -312,13 +305,21 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
     "trpo-lagrangian": OnPolicy(_of_ppo(TrustRegionLoss), method=TRPO()),
     "cpo": OnPolicy(_of_ppo(TrustRegionLoss), tell_violation, method=CPO(), settings=_TRUST_REGION),
     "pcpo": OnPolicy(
-        _of_ppo(TrustRegionLoss), tell_violation, method=PCPO(), settings=_TRUST_REGION
+        _of_ppo(TrustRegionLoss),
+        partial(tell_violation, errors=2.0),
+        method=PCPO(),
+        settings=_TRUST_REGION,
     ),
     "focops": OnPolicy(_of_ppo(FOCOPSLoss)),
     "cup": OnPolicy(_of_ppo(CUPLoss), projects=True),
-    "p3o": OnPolicy(_of_ppo(P3OLoss), tell_mean_violation),
-    "ipo": OnPolicy(_of_ppo(IPOLoss), tell_mean_violation),
-    "crpo": OnPolicy(_wrapping(CRPOLoss, ClipPPOLoss), tell_mean_violation),
+    "p3o": OnPolicy(_of_ppo(P3OLoss), partial(tell_violation, errors=0.0)),
+    "ipo": OnPolicy(_of_ppo(IPOLoss), partial(tell_violation, errors=0.0)),
+    "crpo": OnPolicy(
+        _wrapping(CRPOLoss, ClipPPOLoss),
+        # It swings about what it is told, above the limit as often as below.
+        partial(tell_violation, errors=0.5),
+        settings={"first_log_std": -1.0},
+    ),
     "ppo-saute": OnPolicy(
         _of_ppo(PPOLagrangianLoss),
         keep_multiplier,

@@ -134,6 +134,8 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
             success = f"success {points[name][:, 2].mean():.0%}"
             axis.set_title(f"{label(name)}\n{success}", fontsize=9)
             axis.tick_params(axis="x", labelsize=7)
+        for axis in grid.flat[max(len(names) - columns, 0) : len(names)]:
+            axis.tick_params(axis="x", labelbottom=True)  # Also above an empty place.
         figure.supxlabel("cost of an evaluated episode", fontsize=9)
         figure.supylabel("return", fontsize=9)
         figure.savefig(path)
