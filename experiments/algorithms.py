@@ -303,7 +303,12 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
     ),
     "trpo": OnPolicy(_of_ppo(TrustRegionLoss), keep_multiplier, method=TRPO()),
     "trpo-lagrangian": OnPolicy(_of_ppo(TrustRegionLoss), method=TRPO()),
-    "cpo": OnPolicy(_of_ppo(TrustRegionLoss), tell_violation, method=CPO(), settings=_TRUST_REGION),
+    "cpo": OnPolicy(
+        _of_ppo(TrustRegionLoss),
+        partial(tell_violation, errors=2.0),
+        method=CPO(),
+        settings=_TRUST_REGION,
+    ),
     "pcpo": OnPolicy(
         _of_ppo(TrustRegionLoss),
         partial(tell_violation, errors=2.0),
