@@ -290,8 +290,9 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
     "ppo-lagrangian": OnPolicy(_of_ppo(PPOLagrangianLoss), compiles=True),
     "kl-ppo-lagrangian": OnPolicy(
         _wrapping(LagrangianLoss, KLPENPPOLoss),
-        # It may change by a divergence of 0.01 in each batch: more batches, and less noise.
-        settings={"first_log_std": -1.0, "frames": 256_000},
+        # It may change by a divergence of 0.01 in each batch: more batches, and a multiplier that
+        # does not rise before it has learnt to reach.
+        settings={"frames": 256_000, "first_log_std": -1.0, "multiplier_rate": 0.05},
     ),
     "a2c-lagrangian": OnPolicy(
         _wrapping(LagrangianLoss, A2CLoss),
