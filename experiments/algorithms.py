@@ -292,7 +292,7 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         _wrapping(LagrangianLoss, KLPENPPOLoss),
         # It may change by a divergence of 0.01 in each batch: more batches, and a multiplier that
         # does not rise before it has learnt to reach.
-        settings={"frames": 256_000, "first_log_std": -1.0, "multiplier_rate": 0.05},
+        settings={"frames": 256_000, "first_log_std": -1.0, "multiplier_rate": 0.1},
     ),
     "a2c-lagrangian": OnPolicy(
         _wrapping(LagrangianLoss, A2CLoss),
