@@ -14,7 +14,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import tyro
@@ -26,7 +25,8 @@ from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
 from experiments.grid import run_grid, save_results
-from experiments.style import colour, figure_style, label_ends, limit_line
+from experiments.report import LEARNING, Line, mean_of_known, plot_learning
+from experiments.style import colour
 from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ActionMode, paper_env
 from torchrl_safe.evaluation import evaluate
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
@@ -54,8 +54,6 @@ RERUN_SUCCESS = {"AR1 PPO": 0.85, "AR1 cPPO": 0.78, "AR2 PPO": 0.74, "AR2 cPPO":
 # and shorter ones, most early epochs end no episode, and the multiplier hardly leaves its start.)
 _WORLDS = 2
 _LATE = 20
-#: What returns, costs and shares of success cannot leave.
-_BOUNDS = {"return": (-np.inf, np.inf), "cost": (0.0, np.inf), "success": (0.0, 1.0)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,8 +220,8 @@ def table(runs: list[dict[str, Any]]) -> str:
     ]
     for cell in CELLS:
         mine = [run for run in runs if run["cell"] == cell]
-        average = [_mean(per_epoch(run, "cost")) for run in mine]
-        late = [_mean(per_epoch(run, "success")[-_LATE:]) for run in mine]
+        average = [mean_of_known(per_epoch(run, "cost")) for run in mine]
+        late = [mean_of_known(per_epoch(run, "success")[-_LATE:]) for run in mine]
         test = {
             name: [run["evaluation"][name] for run in mine]
             for name in ("success", "cost", "touched")
@@ -238,60 +236,24 @@ def table(runs: list[dict[str, Any]]) -> str:
 
 
 def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:
-    """Draws the paper's Figure 2: mean and standard deviation over seeds.
+    """Draws the paper's Figure 2, a row for each kind of action."""
 
-    A row for each kind of action. Bands end where there is nothing: below a cost of 0, and beyond
-    a success of 0 and 1.
-    """
-    kinds = dict.fromkeys(cell.partition(" ")[0] for cell in CELLS)
-    with figure_style():
-        figure, grid = plt.subplots(
-            len(kinds),
-            3,
-            figsize=(12, 2.7 * len(kinds)),
-            sharex=True,
-            sharey="col",
-            squeeze=False,
-            layout="constrained",
-        )
-        figure.suptitle(
-            "Running means of ten epochs; bands: one standard deviation over seeds.",
-            fontsize=8,
-            x=0.01,
-            ha="left",
-        )
-        for row, kind in zip(grid, kinds, strict=True):
-            for axis, name in zip(row, ("return", "cost", "success"), strict=True):
-                ends = []
-                for cell in (cell for cell in CELLS if cell.startswith(kind)):
-                    algorithm = "ppo-lagrangian" if "cPPO" in cell else "ppo"
-                    curves = np.array(
-                        [_smooth(per_epoch(r, name)) for r in runs if r["cell"] == cell]
-                    )
-                    thousands = np.arange(1, curves.shape[1] + 1)
-                    middle, low, high = band(curves, _BOUNDS[name])
-                    axis.plot(thousands, middle, color=colour(algorithm))
-                    axis.fill_between(
-                        thousands, low, high, color=colour(algorithm), alpha=0.15, lw=0
-                    )
-                    ends.append((thousands[-1], middle[-1], cell[4:], colour(algorithm)))
-                axis.set_title(f"{kind}: episode {name}")
-                if name == "success":
-                    axis.set_ylim(0, 1)
-                figure.canvas.draw()
-                if name == "cost":
-                    limit_line(axis, cost_limit)
-                label_ends(axis, ends)
-        for axis in grid[-1]:
-            axis.set_xlabel("thousand control steps")
-        figure.savefig(path)
-        plt.close(figure)
+    def lines(action: str, name: str) -> list[Line]:
+        return [
+            Line(
+                algorithm,
+                colour("ppo" if algorithm == "PPO" else "ppo-lagrangian"),
+                [
+                    per_epoch(run, name).tolist()
+                    for run in runs
+                    if run["cell"] == f"{action} {algorithm}"
+                ],
+            )
+            for algorithm in ALGORITHMS
+        ]
 
-
-def band(curves: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, ...]:
-    """Mean of curves, and a standard deviation below and above, within the bounds."""
-    middle, spread = curves.mean(0), curves.std(0)
-    return middle, (middle - spread).clip(*bounds), (middle + spread).clip(*bounds)
+    rows = {action: {name: lines(action, name) for name in LEARNING} for action in ACTIONS}
+    plot_learning(rows, path, frames_per_point=1000, width=10, limits=(cost_limit,))
 
 
 def main(config: Config) -> None:
@@ -307,17 +269,6 @@ def _over_seeds(values: list[float], digits: int = 1) -> str:
 
 def _spread(mean: float, deviation: float, digits: int = 1) -> str:
     return f"{mean:.{digits}f} ± {deviation:.{digits}f}"
-
-
-def _smooth(values: np.ndarray, width: int = 10) -> np.ndarray:
-    """Running mean over epochs, of what there is."""
-    ends = range(1, len(values) + 1)
-    return np.array([_mean(values[max(0, end - width) : end]) for end in ends])
-
-
-def _mean(values: np.ndarray) -> float:
-    """Mean of what is not NaN, if there is any."""
-    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
 if __name__ == "__main__":

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
+import numpy as np
 import torch
 from matplotlib.ticker import EngFormatter
 from PIL import Image
@@ -21,6 +23,8 @@ _CURVES = {
     "cost": "episode cost: ",
     "summed": "cost of all training: ",
 }
+#: What is drawn while policies learn, and what it cannot leave.
+LEARNING = {"return": (-math.inf, math.inf), "cost": (0.0, math.inf), "success": (0.0, 1.0)}
 # Batches over which curves are averaged.
 _SMOOTH = 5
 
@@ -128,14 +132,90 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
         plt.close(figure)
 
 
+class Line(NamedTuple):
+    """Runs of one kind, and how they are drawn."""
+
+    label: str
+    colour: str
+    #: A figure of each batch of each run; NaN where no episode ended.
+    runs: Sequence[Sequence[float]]
+
+
+def plot_learning(
+    rows: Mapping[str, Mapping[str, Sequence[Line]]],
+    path: Path,
+    *,
+    frames_per_point: int,
+    width: int,
+    limits: Sequence[float],
+) -> None:
+    """Draws return, cost and success against frames: mean and standard deviation over seeds.
+
+    Args:
+        rows: the lines of each panel, by title of the row and name in :data:`LEARNING`.
+        path: file to write.
+        frames_per_point: control steps of a batch.
+        width: batches over which lines are averaged.
+        limits: of the cost.
+    """
+    with figure_style():
+        figure, grid = plt.subplots(
+            len(rows),
+            len(LEARNING),
+            figsize=(4 * len(LEARNING), 2.7 * len(rows)),
+            sharex=True,
+            sharey="col",
+            squeeze=False,
+            layout="constrained",
+        )
+        figure.suptitle(
+            f"Running means of {width} batches; bands: one standard deviation over seeds.",
+            fontsize=8,
+            x=0.01,
+            ha="left",
+        )
+        for axes, (title, panels) in zip(grid, rows.items(), strict=True):
+            for axis, (name, bounds) in zip(axes, LEARNING.items(), strict=True):
+                ends = []
+                for line in panels[name]:
+                    curves = np.array([running_mean(run, width) for run in line.runs])
+                    frames = frames_per_point * np.arange(1, curves.shape[1] + 1)
+                    middle, spread = curves.mean(0), curves.std(0)
+                    low, high = (middle - spread).clip(*bounds), (middle + spread).clip(*bounds)
+                    axis.plot(frames, middle, color=line.colour)
+                    axis.fill_between(frames, low, high, color=line.colour, alpha=0.15, lw=0)
+                    ends.append((frames[-1], middle[-1], line.label, line.colour))
+                axis.set_title(f"{title}: episode {name}")
+                axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+                if name == "success":
+                    axis.set_ylim(0, 1)
+                figure.canvas.draw()
+                for limit in limits if name == "cost" else ():
+                    limit_line(axis, limit, text=f"limit {limit:g}", shade=limit == max(limits))
+                label_ends(axis, ends)
+        for axis in grid[-1]:
+            axis.set_xlabel("control steps")
+        figure.savefig(path)
+        plt.close(figure)
+
+
 def running_mean(values: Sequence[float], width: int = _SMOOTH) -> list[float]:
     """Returns the mean of each value and those before it, ``width`` in all at most.
 
+    NaN is left out; the mean of nothing is NaN.
+
     Examples:
-        >>> running_mean([1.0, 3.0, 5.0], width=2)
-        [1.0, 2.0, 4.0]
+        >>> running_mean([1.0, 3.0, float("nan"), 5.0], width=2)
+        [1.0, 2.0, 3.0, 5.0]
     """
-    return [fmean(values[max(0, end - width) : end]) for end in range(1, len(values) + 1)]
+    windows = (values[max(0, end - width) : end] for end in range(1, len(values) + 1))
+    return [mean_of_known(window) for window in windows]
+
+
+def mean_of_known(values: Iterable[float]) -> float:
+    """Returns the mean of what is not NaN; NaN if there is nothing."""
+    known = [value for value in values if not math.isnan(value)]
+    return fmean(known) if known else math.nan
 
 
 def save_picture(env: EnvBase, path: Path) -> None:

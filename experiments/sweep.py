@@ -7,6 +7,7 @@ and PPO for comparison. To resume it, repeat the command: it runs what is missin
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from collections.abc import Iterable
 from itertools import product
@@ -17,11 +18,19 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import tyro
+from matplotlib.colors import to_hex
 
 from experiments import train
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, Observation
 from experiments.grid import run_grid, save_results
-from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
+from experiments.report import (
+    Line,
+    episode_costs,
+    mean_over_seeds,
+    plot_learning,
+    seeds_within,
+    successes,
+)
 from experiments.style import ALARM, INK, colour, cost_axis, figure_style, label, label_ends
 from torchrl_safe.metrics import mean, worst_seed
 
@@ -38,8 +47,8 @@ class Config:
     """What an action moves."""
     observation: Observation = "full"
     """What the policy sees."""
-    physics: Engine = TrainConfig.physics
-    """Engine that simulates the arm."""
+    physics: Engine = "mujoco"
+    """Engine that simulates the arm; bullet takes several times as long."""
     seeds: int = 5
     """Runs for each limit, with seeds from 0."""
     frames: int = TrainConfig.frames
@@ -169,8 +178,36 @@ def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
         plt.close(figure)
 
 
+def plot_curves(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
+    """Draws how PPO and each limit learn; the smaller a limit, the darker its line."""
+    keys = {"return": "return", "cost": "cost/collision", "success": "success"}
+    blues = plt.get_cmap("Blues")(np.linspace(0.95, 0.45, len(config.limits)))
+    hues = dict(zip(sorted(config.limits), map(to_hex, blues), strict=True))
+
+    def lines(action: Action, key: str) -> list[Line]:
+        return [
+            Line(
+                label("ppo") if limit is None else f"limit {limit:g}",
+                colour("ppo") if limit is None else hues[limit],
+                [
+                    [row.get(key, math.nan) for row in run["history"]]
+                    for run in _select(runs, action, limit)
+                ],
+            )
+            for limit in (*config.limits, None)
+        ]
+
+    rows = {
+        f"{action.capitalize()} actions": {name: lines(action, key) for name, key in keys.items()}
+        for action in config.actions
+    }
+    first, *_ = runs
+    frames = first["history"][0]["frames"]
+    plot_learning(rows, path, frames_per_point=frames, width=10, limits=config.limits)
+
+
 def main(config: Config) -> None:
-    """Runs what is missing, then writes table, figure and results.json."""
+    """Runs what is missing, then writes table, figures and results.json."""
     results = run_grid(train.run, jobs(config), workers=config.workers, name="sweep")
     runs = [
         {"action": action, "limit": limit, "seed": seed, **result}
@@ -178,6 +215,7 @@ def main(config: Config) -> None:
     ]
     save_results(config.out, config, runs, table(runs, config))
     plot(runs, config, config.out / "sweep.png")
+    plot_curves(runs, config, config.out / "curves.png")
 
 
 def _name(action: Action, limit: float | None, seed: int) -> str:

@@ -31,8 +31,9 @@ def test_sweep_leaves_table_figure_and_results(swept):
     assert costs.shape == (2, 32)
     assert costs[0].mean().item() == pytest.approx(safe["evaluation"]["cost/collision"][0])
     assert (swept.out / "table.md").read_text() == sweep.table(results["runs"], swept)
-    with Image.open(swept.out / "sweep.png") as image:
-        assert image.width > 500
+    for name in ("sweep", "curves"):
+        with Image.open(swept.out / f"{name}.png") as image:
+            assert image.width > 500
     assert not missing(sweep.jobs(swept))
     assert len(missing(sweep.jobs(dataclasses.replace(swept, seeds=3)))) == 4
 
