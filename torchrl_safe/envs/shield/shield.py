@@ -154,9 +154,9 @@ class Shield:
         >>> env.close()
     """
 
-    margin: float = 0.01
+    margin: float = 0.02
     rate: float = 20.0
-    table: float = 0.015
+    table: float = 0.02
     reach: float = 0.3
     acceleration: float = 10.0
     obstacle_speed: float | None = None
