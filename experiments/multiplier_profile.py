@@ -146,14 +146,12 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
 
 
 def _draw_front(axis: Axes, fixed: dict[float, np.ndarray]) -> None:
-    """Means of fixed multipliers, named and joined; bars reach to the lowest and highest seed."""
-    middle = np.array([rows.mean(0) for rows in fixed.values()])
+    """Every seed of the fixed multipliers; a line joins their medians, which have names."""
+    middle = np.array([np.median(rows, axis=0) for rows in fixed.values()])
     axis.plot(middle[:, 1], middle[:, 0], "-", color=GREY, lw=1, zorder=1)
     for value, rows in fixed.items():
-        reward, cost, *_ = rows.mean(0)
-        axis.plot([rows[:, 1].min(), rows[:, 1].max()], [reward, reward], color=GREY, lw=1)
-        axis.plot([cost, cost], [rows[:, 0].min(), rows[:, 0].max()], color=GREY, lw=1)
-        axis.plot(cost, reward, "o", color=GREY, ms=5, zorder=2)
+        axis.plot(rows[:, 1], rows[:, 0], "o", color=GREY, ms=4, zorder=2)
+        reward, cost, *_ = np.median(rows, axis=0)
         last = value == max(fixed)
         axis.annotate(
             f"multiplier fixed at {value:g}" if last else f"{value:g}",
