@@ -169,7 +169,8 @@ def plot_learning(
             layout="constrained",
         )
         figure.suptitle(
-            f"Running means of {width} batches; bands: one standard deviation over seeds.",
+            f"Running means of {width} batches; bands: one standard deviation over seeds; "
+            "dashed: limits.",
             fontsize=8,
             x=0.01,
             ha="left",
@@ -191,7 +192,9 @@ def plot_learning(
                     axis.set_ylim(0, 1)
                 figure.canvas.draw()
                 for limit in limits if name == "cost" else ():
-                    limit_line(axis, limit, text=f"limit {limit:g}", shade=limit == max(limits))
+                    # Several would overlap, and their lines have names.
+                    text = f"limit {limit:g}" if len(limits) == 1 else ""
+                    limit_line(axis, limit, text=text, shade=limit == max(limits))
                 label_ends(axis, ends)
         for axis in grid[-1]:
             axis.set_xlabel("control steps")
