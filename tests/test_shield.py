@@ -255,6 +255,23 @@ def test_what_comes_is_given_way_to(make_env, engine, turntable):
     assert env.arm_state.joint_position[0, 0] < -0.1
 
 
+def test_what_comes_is_given_way_to_as_far_as_what_stands_allows(make_env, engine, turntable):
+    """On one side of the bar a ball comes at 0.4 m/s, on the other one leaves room for 2 mm."""
+
+    def path(times):
+        comes = np.array([0.45, 0.18, 0.5]) - 0.4 * times[:, None] * [0, 1, 0]
+        stands = np.tile([0.45, -0.172, 0.5], (len(times), 1))
+        orientations = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 2, 1))
+        return np.stack([comes, stands], axis=1), orientations
+
+    positions = [(0.45, 0.18, 0.5), (0.45, -0.172, 0.5)]
+    layout = Places(Sphere(0.1), Sphere(0.1), at=positions, path=path)
+    env = make_env(ArmEnv, **{**turntable, "obstacles": layout, "shield": SLOW})
+    env.reset()
+    assert step(env, 1.0)["shield_braked"].item()
+    assert env.arm_state.joint_position[0, 0] == pytest.approx(-0.002 / 0.45, abs=1e-3)
+
+
 def test_what_may_come_is_not_approached(make_env, engine, turntable):
     """In a step of 1/20 s a ball of up to 2 m/s could take up the whole room."""
     shield = Shield(obstacle_speed=2.0)

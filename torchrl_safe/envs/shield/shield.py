@@ -22,6 +22,8 @@ _ERROR = 0.1
 _SHORTEST, _FAR = 1e-3, 1e3
 # Below this, a distance counts as 0, m.
 _TOLERANCE = 1e-9
+# What a moving obstacle comes too near counts as much as this turn of a joint, m/rad.
+_GIVES = 1e-3
 # The share of the joints' braking that a distance counts on: some joints may have to keep turning.
 _SURE = 1 / 3
 
@@ -104,7 +106,8 @@ class Shield:
     In it, one more step like this one, slower by b, has to be safe too.
 
     If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
-    motion that does not use up more than all the room. If there is none, it stands still.
+    motion that does not use up more than all the room. If there is none, it stands still, or gives
+    way to what comes as far as what stands allows.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -210,7 +213,9 @@ class Shield:
         last = least.copy()
         pairs = now.room.shape[1]
         last[:, :pairs] = np.minimum(last[:, :pairs], now.closing - now.room)
-        change, solved, braked = _solve(asked, rows, least, last, lower, upper)
+        comes = np.zeros(least.shape, dtype=bool)
+        comes[:, :pairs] = now.closing > 0
+        change, solved, braked = _solve(asked, rows, least, last, comes, lower, upper)
         # Measure the end of the step as well where it could be too near.
         left = now.room - now.closing + (now.joints @ change[:, :, None])[:, :, 0]
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
@@ -232,6 +237,7 @@ class Shield:
                 np.concatenate([rows[again], then.joints[short]], axis=1),
                 np.concatenate([least[again], needed[short]], axis=1),
                 np.concatenate([last[again], most[short]], axis=1),
+                np.concatenate([comes[again], then.closing[short] > 0], axis=1),
                 lower[again],
                 upper[again],
             )
@@ -343,9 +349,18 @@ def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
 
 
 def _solve(
-    asked: Array, rows: Array, least: Array, last: Array, lower: Array, upper: Array
+    asked: Array,
+    rows: Array,
+    least: Array,
+    last: Array,
+    comes: NDArray[np.bool_],
+    lower: Array,
+    upper: Array,
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Projects; where there is no solution, to a stand, with ``last`` in place of ``least``.
+
+    Where there is none either, what ``comes`` may come nearer, as little as possible. The joints may
+    then brake as hard as they can.
 
     Returns:
         The solutions, where there is one, and which are not of what was asked for.
@@ -354,7 +369,20 @@ def _solve(
     braked = ~solved
     some = np.flatnonzero(braked)
     if len(some):
+        still = np.zeros_like(asked[some])
         change[some], solved[some] = project(
-            np.zeros_like(asked[some]), rows[some], last[some], lower[some], upper[some]
+            still, rows[some], last[some], lower[some], upper[some]
         )
+    some = np.flatnonzero(~solved & comes.any(axis=1))
+    if len(some):
+        # One more unknown: by how much what comes is too near, in units of _GIVES.
+        none = np.zeros((len(some), 1))
+        point, solved[some] = project(
+            np.zeros((len(some), asked.shape[1] + 1)),
+            np.concatenate([rows[some], _GIVES * comes[some, :, None]], axis=2),
+            last[some],
+            np.concatenate([np.minimum(lower[some], 0), none], axis=1),
+            np.concatenate([np.maximum(upper[some], 0), none + np.inf], axis=1),
+        )
+        change[some] = point[:, :-1]
     return change, solved, braked
