@@ -359,8 +359,8 @@ def _solve(
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Projects; where there is no solution, to a stand, with ``last`` in place of ``least``.
 
-    Where there is none either, what ``comes`` may come nearer, as little as possible. The joints may
-    then brake as hard as they can.
+    Where there is none either, what ``comes`` may come nearer, as little as possible. The joints
+    may then brake as hard as they can.
 
     Returns:
         The solutions, where there is one, and which are not of what was asked for.
