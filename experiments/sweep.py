@@ -53,6 +53,8 @@ class Config:
     """Runs for each limit, with seeds from 0."""
     frames: int = TrainConfig.frames
     """Control steps to train for."""
+    frames_per_batch: int = TrainConfig.frames_per_batch
+    """Control steps between two updates of policy and multiplier."""
     episode_steps: int | None = TrainConfig.episode_steps
     """Control steps after which an episode to learn from is cut off."""
     first_log_std: float = TrainConfig.first_log_std
@@ -77,6 +79,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
                 cost_limit=limit or 0.0,
                 seed=seed,
                 frames=config.frames,
+                frames_per_batch=config.frames_per_batch,
                 episode_steps=config.episode_steps,
                 first_log_std=config.first_log_std,
                 eval_episodes=config.eval_episodes,
