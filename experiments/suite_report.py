@@ -173,7 +173,7 @@ def plot_profiles(runs: Sequence[Run], limits: Limits, path: Path) -> None:
             )
         axes[0].set(xlabel="success", ylabel="share of runs with more", ylim=(-0.02, 1.04))
         axes[1].set(xlabel="largest cost / limit", xscale="log", ylim=(-0.02, 1.04))
-        limit_line(axes[1], 1, vertical=True)
+        limit_line(axes[1], 1, vertical=True, text="")  # The axis says it.
         _save(figure, path)
 
 
