@@ -162,8 +162,8 @@ class Config:
     multiplier_rate: float = 0.2
     """What a batch far above its limit adds to the multiplier."""
     pessimism: float = 2.0
-    """Standard errors added to the mean cost of a batch: twice as many with cpo and pcpo, half as
-    many with crpo, none with p3o and ipo."""
+    """Standard errors added to the mean cost of a batch: twice as many with cpo and pcpo, none
+    with p3o and ipo."""
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "jobs", "eval_episodes", "frames_per_batch")
