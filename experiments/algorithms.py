@@ -222,6 +222,7 @@ class OffPolicy:
             loss,
             agent.actor,
             learning_rate=2 * config.learning_rate,
+            batches=math.ceil(config.frames / config.frames_per_batch),
             capacity=config.frames,
             minibatch=config.minibatch,
             steps_per_update=8,

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torchrl.data import (
     LazyTensorStorage,
     RandomSampler,
@@ -123,9 +124,7 @@ class OnPolicyLearner:
         if actor_step is None:
             groups.append({"params": self.policy, "lr": learning_rate})
         self.optimizer = torch.optim.Adam(groups, fused=True)
-        self.schedule = torch.optim.lr_scheduler.LinearLR(
-            self.optimizer, 1.0, 0.0, total_iters=batches
-        )
+        self.schedule = _falling(self.optimizer, batches)
 
     def learn(self, batch: TensorDictBase) -> None:
         data = self.loss.estimate_advantages(batch).reshape(-1)
@@ -165,7 +164,8 @@ class ReplayLearner:
     Args:
         loss: an off-policy loss with target networks.
         actor: the policy in it.
-        learning_rate: Adam's, of all networks.
+        learning_rate: Adam's, of all networks; it falls linearly to 0 over ``batches``.
+        batches: how many batches there will be.
         capacity: control steps to keep.
         minibatch: control steps in a sample.
         steps_per_update: collected control steps for each gradient step.
@@ -177,6 +177,7 @@ class ReplayLearner:
         actor: TensorDictModuleBase,
         *,
         learning_rate: float,
+        batches: int,
         capacity: int,
         minibatch: int,
         steps_per_update: int,
@@ -186,6 +187,7 @@ class ReplayLearner:
         self.objective = summed(loss)
         self.policy = list(actor.parameters())
         self.optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate, fused=True)
+        self.schedule = _falling(self.optimizer, batches)
         self.buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(capacity), sampler=RandomSampler(), batch_size=minibatch
         )
@@ -195,12 +197,18 @@ class ReplayLearner:
         for _ in range(batch.numel() // self.steps_per_update):
             _descend(self.objective(self.buffer.sample()), self.optimizer, self.policy)
             self.targets.step()
+        self.schedule.step()
 
     def state(self) -> dict[str, Any]:
-        return {"loss": self.loss, "optimizer": self.optimizer}
+        return {"loss": self.loss, "optimizer": self.optimizer, "schedule": self.schedule}
 
     def memory(self) -> dict[str, Any]:
         return {"buffer": self.buffer}
+
+
+def _falling(optimizer: torch.optim.Optimizer, batches: int) -> LRScheduler:
+    """Learning rates that fall linearly to 0."""
+    return LinearLR(optimizer, 1.0, 0.0, total_iters=batches)
 
 
 def _descend(
