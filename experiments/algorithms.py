@@ -276,11 +276,12 @@ def _terminating(config: Config) -> list[Transform]:
 # batches, which tell better what a policy costs, as many of them, and less noise.
 _TRUST_REGION = {"frames": 256_000, "frames_per_batch": 2048, "first_log_std": -1.0}
 _A2C = {
-    "frames": 512_000,
-    "frames_per_batch": 256,
+    "frames": 768_000,
+    "frames_per_batch": 512,
+    "minibatch": 128,
     "learning_rate": 1e-3,
     "first_log_std": -1.0,
-    "multiplier_rate": 0.0125,
+    "multiplier_rate": 0.01,
 }
 # Nearer and faster than the default, and less safe in PyBullet. In MuJoCo, where these policies are
 # trained, the motors follow twice as large a change of velocity.
