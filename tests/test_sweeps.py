@@ -144,7 +144,7 @@ def test_comparison_has_settings_and_limits_of_their_own_for_some(tmp_path):
     settings = {algorithm: config for config, algorithm in jobs.values()}
     assert len(settings) == 17
     assert settings["ppo"].frames == settings["ppo-lagrangian"].frames == 128_000
-    assert settings["a2c-lagrangian"].frames_per_batch == 256
+    assert settings["a2c-lagrangian"].frames_per_batch == 512
     assert {n for n, c in settings.items() if c.cost_limit == 2} == {*compare.BUDGETS}
     higher = compare.jobs(compare.Config(seeds=1, cost_limit=5.0, out=tmp_path))
     assert {config.cost_limit for config, _ in higher.values()} == {5.0}
