@@ -359,11 +359,17 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
 }
 
 
-def configured(config: Config, algorithm: AlgorithmName) -> Config:
-    """Returns the configuration with the algorithm's own settings where it has the defaults."""
+def own_settings(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
+    """Returns what the algorithm sets: options of its own where the configuration has defaults."""
+    if not config.own_settings:
+        return {}
     default, own = Config(), ALGORITHMS[algorithm].settings
-    at_default = [name for name in own if getattr(config, name) == getattr(default, name)]
-    return replace(config, **{name: own[name] for name in at_default})
+    return {name: own[name] for name in own if getattr(config, name) == getattr(default, name)}
+
+
+def configured(config: Config, algorithm: AlgorithmName) -> Config:
+    """Returns the configuration with what the algorithm sets."""
+    return replace(config, **own_settings(config, algorithm))
 
 
 def _start_multiplier(loss: LossModule, updater: Any, config: Config) -> None:

@@ -95,6 +95,9 @@ class Config:
     """Algorithms to train; ppo is PPO-Lagrangian with its multiplier fixed at 0. ppo-shield is ppo
     with a shield, which corrects actions so that the arm stays clear of obstacles while it learns.
     With ppo-lagrangian-shield and a limit on the correction, the policy needs no shield later."""
+    own_settings: bool = True
+    """Let algorithms set options that are at their defaults; make train says which. With
+    --no-own-settings they do not, so that --frames 128000 is 128,000 for all of them."""
     shield: bool = False
     """Train ppo-shield as well, and draw the collisions summed over all of training."""
     cost_limit: float = 0.5
@@ -318,7 +321,9 @@ GROUPS = {
     "What to train in": (
         *("task", "arm", "obstacles", "action", "observation", "physics", "suite_task", "paper"),
     ),
-    "What to train": ("algorithms", "shield", "cost_limit", "costs", "frames", "seed"),
+    "What to train": (
+        *("algorithms", "own_settings", "shield", "cost_limit", "costs", "frames", "seed"),
+    ),
     "The run": ("out", "resume", "logger", "checkpoint_every", "eval_episodes"),
     "Speed": ("envs", "workers", "jobs"),
     "Learning": (

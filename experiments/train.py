@@ -25,7 +25,7 @@ from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
-from experiments.algorithms import ALGORITHMS, Training, configured
+from experiments.algorithms import ALGORITHMS, Training, configured, own_settings
 from experiments.config import AlgorithmName, Config, command_line
 from experiments.demonstrations import CARE, start_from_demonstrations
 from experiments.files import is_new, write_whole
@@ -216,8 +216,8 @@ def train(
 ) -> tuple[TensorDictModuleBase, Log]:
     """Trains with one algorithm; returns the policy and the figures of each batch.
 
-    ``line`` is where the progress is shown, below the first. Where the configuration has defaults,
-    the algorithm's own settings take their place.
+    ``line`` is where the progress is shown, below the first. Unless ``config.own_settings`` is
+    False, the algorithm sets some of the options that are at their defaults.
     """
     config = configured(config, algorithm)
     # TorchRL's notes on each buffer would break up the progress bar.
@@ -418,6 +418,10 @@ def main(config: Config) -> None:
     """Trains and evaluates each algorithm, then writes the comparison."""
     results = start(config)
     todo = [name for name in config.chosen if name not in results["algorithms"]]
+    for name in todo:
+        if own := own_settings(config, name):
+            chosen = ", ".join(f"{option} {value:g}" for option, value in own.items())
+            print(f"{name} has settings of its own (--no-own-settings): {chosen}.")
     for algorithm, result in finish(config, todo):
         done = {**results["algorithms"], algorithm: result}
         # In one order, whichever ends first.

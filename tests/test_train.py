@@ -265,6 +265,8 @@ def test_an_algorithm_has_its_own_settings_where_none_are_given():
     assert (asked.frames, asked.frames_per_batch, asked.learning_rate) == (1024, 512, 1e-4)
     config = Config()
     assert configured(config, "ppo") == configured(config, "ppo-lagrangian") == config
+    config = Config(own_settings=False)
+    assert configured(config, "a2c-lagrangian") == config
 
 
 # One of each kind for `make test`. That they learn is tested on a problem of known optimum.
