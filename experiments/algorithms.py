@@ -124,6 +124,7 @@ class OnPolicy:
         epochs: passes over a batch, if not those of the configuration.
         method: the step that a trust-region method takes with the actor.
         projects: whether each batch has a second phase, CUP's projection.
+        max_kl: how far the policy may move in a batch, in nats, before its passes end.
         compiles: whether the loss is compiled in long runs. (Losses that ask PyTorch for the
             divergence of two distributions do not compile to one graph.)
         transforms: called as ``transforms(config)``, what is appended to the environment.
@@ -137,6 +138,7 @@ class OnPolicy:
     epochs: int | None = None
     method: TrustRegionMethod | None = None
     projects: bool = False
+    max_kl: float = math.inf
     compiles: bool = False
     transforms: Callable[[Config], list[Transform]] = no_transforms
     training_transforms: Callable[[Config], list[Transform]] = no_transforms
@@ -172,6 +174,7 @@ class OnPolicy:
             epochs=epochs,
             minibatch=config.minibatch,
             phases=phases,
+            max_kl=self.max_kl,
             actor_step=step,
         )
         updater = self.updater(loss, config)
@@ -326,8 +329,8 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         method=PCPO(),
         settings=_TRUST_REGION,
     ),
-    "focops": OnPolicy(_of_ppo(FOCOPSLoss)),
-    "cup": OnPolicy(_of_ppo(CUPLoss), projects=True),
+    "focops": OnPolicy(_of_ppo(FOCOPSLoss), max_kl=0.02),
+    "cup": OnPolicy(_of_ppo(CUPLoss), projects=True, max_kl=0.02),
     "p3o": OnPolicy(_of_ppo(P3OLoss), partial(tell_violation, errors=0.0)),
     "ipo": OnPolicy(_of_ppo(IPOLoss), partial(tell_violation, errors=0.0)),
     "crpo": OnPolicy(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -9,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.distributions import Distribution, kl_divergence
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torchrl.data import (
     LazyTensorStorage,
@@ -56,6 +58,20 @@ def summed(loss: Callable[[TensorDictBase], TensorDictBase]) -> Objective:
     return total
 
 
+def moved_from_here(actor: TensorDictModuleBase, data: TensorDictBase) -> Callable[[], float]:
+    """Returns a function that says how far a policy has moved since this call.
+
+    It returns the divergence from the policy as it is now, in nats: a mean over the states.
+    """
+
+    @torch.no_grad()
+    def policy() -> Distribution:
+        return actor.get_dist(data.select(*actor.in_keys))
+
+    before = policy()
+    return lambda: kl_divergence(before, policy()).mean().item()
+
+
 class NoiseSchedule:
     """Moves the standard deviation of a policy from batch to batch, geometrically.
 
@@ -98,6 +114,8 @@ class OnPolicyLearner:
         epochs: passes over each batch, in each phase.
         minibatch: control steps in a minibatch.
         phases: what is minimized, one after the other, each with what is to be done before.
+        max_kl: a phase ends after the pass that has moved the policy further than this mean
+            divergence, in nats; by default none does.
         actor_step: moves the actor instead of the optimizer.
     """
 
@@ -112,10 +130,11 @@ class OnPolicyLearner:
         epochs: int,
         minibatch: int,
         phases: Sequence[tuple[Callable[[], None] | None, Objective]],
+        max_kl: float = math.inf,
         actor_step: TrustRegionStep | None = None,
     ) -> None:
-        self.loss, self.noise, self.actor_step = loss, noise, actor_step
-        self.epochs, self.minibatch = epochs, minibatch
+        self.loss, self.actor, self.noise, self.actor_step = loss, actor, noise, actor_step
+        self.epochs, self.minibatch, self.max_kl = epochs, minibatch, max_kl
         self.phases = phases
         self.policy = list(actor.parameters())
         moved_here = {id(parameter) for parameter in self.policy}
@@ -137,11 +156,14 @@ class OnPolicyLearner:
         for prepare, objective in self.phases:
             if prepare is not None:
                 prepare()
+            moved = moved_from_here(self.actor, data)
             for epoch in range(self.epochs):
                 # All passes have the same shapes and modules, so the first checks them for all.
                 with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
                     for minibatch in data[torch.randperm(len(data))].split(self.minibatch):
                         _descend(objective(minibatch), self.optimizer, self.policy)
+                if self.max_kl < math.inf and moved() > self.max_kl:
+                    break
         self.schedule.step()
         self.noise.step()
 

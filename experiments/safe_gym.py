@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from time import strftime
@@ -24,7 +24,6 @@ import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import Tensor
-from torch.distributions import kl_divergence
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase, RewardSum
@@ -35,7 +34,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
 from experiments.compiling import compiled
 from experiments.files import is_new, write_whole
-from experiments.learners import NOT_LEARNT_FROM, summed
+from experiments.learners import NOT_LEARNT_FROM, Objective, moved_from_here, summed
 from experiments.log import Log, figures, versions
 from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.envs.gym import SafeGymEnv
@@ -345,49 +344,46 @@ class Learner:
 
     def learn(self, batch: TensorDictBase) -> float:
         """Learns from a batch as the collector returns it; returns how far the policy moved."""
-        actor = self.agent.actor
         with torch.no_grad():  # Once for the batch, not in each step. Writes loc and scale too.
-            before = actor.get_dist(batch)
-            batch["action_log_prob"] = before.log_prob(batch["action"])
+            policy = self.agent.actor.get_dist(batch)
+            batch["action_log_prob"] = policy.log_prob(batch["action"])
         self.loss.estimate_advantages(batch)
         self.agent.critic.module.change_units(batch["value_target"])
         self.agent.cost_critic.module.change_units(batch["cost_value_target"])
         data = batch.exclude(*NOT_LEARNT_FROM).reshape(-1)
+        moved = moved_from_here(self.agent.actor, data)
         if self.step is not None:
             self.step.step(data)
-        for epoch in range(self.epochs):
-            # All passes have the same shapes and modules, so the first checks them for all.
-            with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
-                for minibatch in self._minibatches(data):
-                    self._descend(self.objective(minibatch))
-            with torch.no_grad():
-                now = actor.get_dist(batch.select("observation"))
-                kl = kl_divergence(before, now).mean().item()
-            if not math.isfinite(kl):
-                raise ValueError(f"The policy is not finite after pass {epoch}.")
-            if kl > self.config.max_kl and self.step is None:
-                break
+        self._descend(self.objective, data, moved)
+        kl = moved()
         if self.projection is not None:
             self.loss.start_projection()
-            for _ in range(epoch + 1):
-                for minibatch in self._minibatches(data):
-                    self._descend(self.projection(minibatch))
+            self._descend(self.projection, data, moved_from_here(self.agent.actor, data))
         self.schedule.step()
         # Last: the policy that collected the batch is the one that learnt from it.
         self.agent.standardize.update(batch["observation"])
         return kl
 
-    def _minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
-        # The steps that do not fill a minibatch are left out, others in each pass.
+    def _descend(
+        self, objective: Objective, data: TensorDictBase, moved: Callable[[], float]
+    ) -> None:
+        """Goes through the data until the policy has moved further than ``max_kl``."""
         size = self.config.minibatch
-        order = torch.randperm(len(data))[: len(data) // size * size]
-        yield from data[order].split(size)
-
-    def _descend(self, loss: Tensor) -> None:
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.policy, self.config.max_grad_norm)
-        self.optimizer.step()
-        self.optimizer.zero_grad()
+        for epoch in range(self.epochs):
+            # The steps that do not fill a minibatch are left out, others in each pass.
+            order = torch.randperm(len(data))[: len(data) // size * size]
+            # All passes have the same shapes and modules, so the first checks them for all.
+            with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
+                for minibatch in data[order].split(size):
+                    objective(minibatch).backward()
+                    torch.nn.utils.clip_grad_norm_(self.policy, self.config.max_grad_norm)
+                    self.optimizer.step()
+                    self.optimizer.zero_grad()
+            kl = moved()
+            if not math.isfinite(kl):
+                raise ValueError(f"The policy is not finite after pass {epoch}.")
+            if kl > self.config.max_kl and self.step is None:
+                break
 
 
 def begin_episodes(config: Config, collector: Collector, frames: int) -> None:
