@@ -282,7 +282,6 @@ _A2C = {
     "frames": 768_000,
     "frames_per_batch": 512,
     "minibatch": 128,
-    "learning_rate": 1e-3,
     "first_log_std": -1.0,
     "multiplier_rate": 0.01,
 }

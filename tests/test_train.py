@@ -260,9 +260,9 @@ def test_every_algorithm_has_a_name():
 
 def test_an_algorithm_has_its_own_settings_where_none_are_given():
     own = configured(Config(), "a2c-lagrangian")
-    assert (own.frames, own.frames_per_batch, own.learning_rate) == (768_000, 512, 1e-3)
-    asked = configured(Config(frames=1024, learning_rate=1e-4), "a2c-lagrangian")
-    assert (asked.frames, asked.frames_per_batch, asked.learning_rate) == (1024, 512, 1e-4)
+    assert (own.frames, own.frames_per_batch, own.multiplier_rate) == (768_000, 512, 0.01)
+    asked = configured(Config(frames=1024, multiplier_rate=0.3), "a2c-lagrangian")
+    assert (asked.frames, asked.frames_per_batch, asked.multiplier_rate) == (1024, 512, 0.3)
     config = Config()
     assert configured(config, "ppo") == configured(config, "ppo-lagrangian") == config
     config = Config(own_settings=False)
