@@ -124,7 +124,7 @@ class OnPolicy:
         epochs: passes over a batch, if not those of the configuration.
         method: the step that a trust-region method takes with the actor.
         projects: whether each batch has a second phase, CUP's projection.
-        max_kl: how far the policy may move in a batch, in nats, before its passes end.
+        max_kl: how far the policy may move in a phase, in nats, before it ends.
         compiles: whether the loss is compiled in long runs. (Losses that ask PyTorch for the
             divergence of two distributions do not compile to one graph.)
         transforms: called as ``transforms(config)``, what is appended to the environment.
@@ -328,6 +328,8 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         method=PCPO(),
         settings=_TRUST_REGION,
     ),
+    # Nothing in these losses brings the policy back. Their authors end the passes over a batch once
+    # it has moved too far; where its noise is small, one pass is already too far.
     "focops": OnPolicy(_of_ppo(FOCOPSLoss), max_kl=0.02),
     "cup": OnPolicy(_of_ppo(CUPLoss), projects=True, max_kl=0.02),
     "p3o": OnPolicy(_of_ppo(P3OLoss), partial(tell_violation, errors=0.0)),
@@ -351,12 +353,12 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         training_transforms=_terminating,
         settings={"first_log_std": -1.0},  # For the same reason.
     ),
-    "sac-lagrangian": OffPolicy(SACLagrangianLoss, stochastic=True),
+    "sac-lagrangian": OffPolicy(SACLagrangianLoss, stochastic=True, settings={"frames": 192_000}),
     "td3-lagrangian": OffPolicy(
         TD3LagrangianLoss,
         stochastic=False,
         # Its critics learn from old episodes too, and follow a multiplier slowly.
-        settings={"multiplier_rate": 0.05},
+        settings={"frames": 192_000, "multiplier_rate": 0.05},
     ),
 }
 

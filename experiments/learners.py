@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -114,8 +114,8 @@ class OnPolicyLearner:
         epochs: passes over each batch, in each phase.
         minibatch: control steps in a minibatch.
         phases: what is minimized, one after the other, each with what is to be done before.
-        max_kl: a phase ends after the pass that has moved the policy further than this mean
-            divergence, in nats; by default none does.
+        max_kl: a phase ends after the gradient step that has moved the policy further than this
+            mean divergence, in nats.
         actor_step: moves the actor instead of the optimizer.
     """
 
@@ -157,15 +157,18 @@ class OnPolicyLearner:
             if prepare is not None:
                 prepare()
             moved = moved_from_here(self.actor, data)
-            for epoch in range(self.epochs):
-                # All passes have the same shapes and modules, so the first checks them for all.
-                with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
-                    for minibatch in data[torch.randperm(len(data))].split(self.minibatch):
-                        _descend(objective(minibatch), self.optimizer, self.policy)
+            for minibatch in self._minibatches(data):
+                _descend(objective(minibatch), self.optimizer, self.policy)
                 if self.max_kl < math.inf and moved() > self.max_kl:
                     break
         self.schedule.step()
         self.noise.step()
+
+    def _minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
+        for epoch in range(self.epochs):
+            # All passes have the same shapes and modules, so the first checks them for all.
+            with torch.compiler.set_stance(skip_guard_eval_unsafe=epoch > 0):
+                yield from data[torch.randperm(len(data))].split(self.minibatch)
 
     def state(self) -> dict[str, Any]:
         state = {
