@@ -357,8 +357,9 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
     "td3-lagrangian": OffPolicy(
         TD3LagrangianLoss,
         stochastic=False,
-        # Its critics learn from old episodes too, and follow a multiplier slowly.
-        settings={"frames": 192_000, "multiplier_rate": 0.05},
+        # Its critics learn from old episodes too, and follow a multiplier slowly. One that rises
+        # before it has learnt to reach keeps it away from the target.
+        settings={"frames": 192_000, "multiplier_rate": 0.02},
     ),
 }
 
