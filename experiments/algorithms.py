@@ -330,7 +330,8 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
     ),
     # Nothing in these losses brings the policy back. Their authors end the passes over a batch once
     # it has moved too far; where its noise is small, one pass is already too far.
-    "focops": OnPolicy(_of_ppo(FOCOPSLoss), max_kl=0.02),
+    # FOCOPS moves less in each batch then, and takes more of them.
+    "focops": OnPolicy(_of_ppo(FOCOPSLoss), max_kl=0.02, settings={"frames": 256_000}),
     "cup": OnPolicy(_of_ppo(CUPLoss), projects=True, max_kl=0.02),
     "p3o": OnPolicy(_of_ppo(P3OLoss), partial(tell_violation, errors=0.0)),
     "ipo": OnPolicy(_of_ppo(IPOLoss), partial(tell_violation, errors=0.0)),
