@@ -290,9 +290,11 @@ _LARGE = {
 }
 # The demonstrations do the task and do not keep its limits, which are left to learn.
 _HANDLING = {**_LARGE, "care": "hurried", "frames": 262_144}
-# More noise pushes the cube away, and the hand against what is beside it.
+# More noise pushes the cube away, and the hand against what is beside it. With as little noise a
+# rate of 1e-3 undoes what was imitated, and leaves states in which the arm gets stuck.
 _PUSHING = {
     **_HANDLING,
+    "learning_rate": 3e-4,
     "demonstrations": 98_304,
     "first_log_std": -1.7,
     "last_log_std": -2.5,
