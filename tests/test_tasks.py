@@ -141,10 +141,26 @@ def test_reward_of_pushing_is_progress():
         object_position=[[[0, 0, 0]], [[0.3, 0.37, 0]]],
         previous=before,
     )
-    # From 0.5 + 0.2 to 0.5 + 0.1, and from 0.5 to nothing.
-    np.testing.assert_allclose(Push(radius=0.05).reward(after), [2, 10])
-    np.testing.assert_allclose(Push(radius=0.1).reward(after), [1, 5])
+    # From 0.5 + 0.2 to 0.5 + 0.1, and from 0.5 to nothing, with 10 for it.
+    np.testing.assert_allclose(Push(radius=0.05).reward(after), [2, 10 + 10])
+    np.testing.assert_allclose(Push(radius=0.1).reward(after), [1, 5 + 10])
     np.testing.assert_array_equal(Push().reward(before), [0, 0])
+
+
+@each_object_task
+def test_an_object_that_falls_off_the_table_earns_nothing_more(kind):
+    """It falls without end: 490 m in ten seconds, thousands of radii."""
+    still = {"goal": [[0.5, 0, 0]] * 2, "finger_position": np.zeros((2, 2))}
+
+    def fallen(depths, previous):
+        places = [[[0.9, 0, -depth]] for depth in depths]
+        return make_state(**still, object_position=places, previous=previous)
+
+    first = fallen([2, 400], make_state(**still))
+    lost = kind().reward(first)
+    assert lost[0] == lost[1]
+    assert -2 / 0.05 <= lost[0] < 0
+    np.testing.assert_array_equal(kind().reward(fallen([3, 490], first)), 0)
 
 
 def test_reward_of_picking_up_is_progress():

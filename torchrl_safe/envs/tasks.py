@@ -18,8 +18,10 @@ from torchrl_safe.envs.state import ArmState, Array
 _ATTEMPTS, _PAIRS = 30, 64
 # Half the width of closed fingers, m.
 _HALF_A_TOOL = 0.01
-# What it is worth to have picked up and placed.
+# What it is worth to bring an object to its goal.
 _BONUS = 10.0
+# An object that is further away, m, has left the table, and falls without end.
+_LOST = 1.0
 # Lengths to pick up, m: how much wider than the object fingers open on each side, and how near to
 # it they hold it; how high the tool comes; what the object's way counts as while nothing holds it.
 _ROOM, _CLOSED, _ABOVE, _FAR = 0.02, 0.004, 0.06, 0.5
@@ -131,13 +133,15 @@ class Push:
     has to go round an obstacle.
 
     The reward of a step is the progress :math:`(w - w') / \text{radius}`, where w and w' are what
-    is left to do before and after it. With the object at o, the goal at g and the tool at t,
+    is left to do before and after it, and 10 more at success. With the object at o, the goal at g
+    and the tool at t,
 
     .. math::
-        w = |o - g| + |t - b|
+        w = \min(|o - g|, 1) + \min(|t - b|, 1)
 
     where b is behind the object, seen from the goal, and at its upper half: panda-gym's dense
-    reward :math:`-|o - g|` does not change before the first touch. At success w' is 0. Progress is
+    reward :math:`-|o - g|` does not change before the first touch. An object more than 1 m away has
+    left the table, and nothing changes while it falls. At success w' is 0. Progress is
     potential-based shaping (Ng et al. 1999), :math:`\gamma \Phi(s') - \Phi(s)` with :math:`\Phi =
     -w / \text{radius}`, of the reward :math:`-(1 - \gamma) w' / \text{radius}`, for every discount
     :math:`\gamma`: the same policies are best with and without it, and a critic has less to learn.
@@ -200,7 +204,7 @@ class Push:
         behind = place - (max(self.shape.half_extents[:2]) + _HALF_A_TOOL) * forward
         behind[:, 2] += self.shape.half_extents[2] / 2
         to_behind = np.linalg.norm(state.ee_position - behind, axis=1)
-        return _object_distance(state) + to_behind
+        return np.minimum(_object_distance(state), _LOST) + np.minimum(to_behind, _LOST)
 
 
 @dataclass(frozen=True)
@@ -215,10 +219,10 @@ class PickAndPlace:
     the fingers: ``CartesianDelta(finger_step=0.04)``, and an episode needs
     ``max_episode_steps=100``.
 
-    The reward of a step is the progress, as in :class:`Push`, and 10 more at success, with
+    The reward of a step is the progress and 10 more at success, as in :class:`Push`, with
 
     .. math::
-        w = c + |t - o| + h + 3 f
+        w = c + \min(|t - o|, 1) + h + 3 f
 
     - c is :math:`|o - g|` while the object is held, and 0.5 m, its largest value, while it is not,
       so pushing the object is no progress.
@@ -283,7 +287,7 @@ class PickAndPlace:
                 "CartesianDelta(finger_step=0.04); this one has no finger_step."
             )
         if self.shaped and not self.sparse:
-            return _progress(state, self._way, self.radius) + _BONUS * self.success(state)
+            return _progress(state, self._way, self.radius)
         return _reward(_object_distance(state), self.radius, self.sparse)
 
     def success(self, state: ArmState) -> NDArray[np.bool_]:
@@ -300,7 +304,7 @@ class PickAndPlace:
         fingers = np.where(inside, to_close, np.maximum(0, half + _ROOM - opening) + _ROOM)
         held = inside & (to_close < _CLOSED)
         carrying = np.where(held, np.minimum(_object_distance(state), _FAR), _FAR)
-        return carrying + distance + too_low + 3 * fingers
+        return carrying + np.minimum(distance, _LOST) + too_low + 3 * fingers
 
 
 def _check(region: Region | None, radius: float) -> None:
@@ -320,11 +324,11 @@ def _reward(distance: Array, radius: float, sparse: bool) -> Array:
 
 
 def _progress(state: ArmState, way: Callable[[ArmState], Array], radius: float) -> Array:
-    """How much less there is left to do after a step, in radii; nothing at success."""
+    """How much less there is left to do after a step, in radii; at success nothing, and a bonus."""
     if state.previous is None:
         return np.zeros(len(state.goal))
-    left = np.where(_object_distance(state) < radius, 0, way(state))
-    return (way(state.previous) - left) / radius
+    success = _object_distance(state) < radius
+    return (way(state.previous) - np.where(success, 0, way(state))) / radius + _BONUS * success
 
 
 def _object_distance(state: ArmState) -> Array:
