@@ -7,8 +7,11 @@ from functools import partial
 import pytest
 import torch
 from on_policy import make_loss
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from tensordict.utils import unravel_key
 from torch.distributions import kl_divergence
+from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, PPOLoss, SoftUpdate
 from torchrl.objectives.value import TD0Estimator
 
@@ -27,6 +30,7 @@ from torchrl_safe.objectives.on_policy.crpo import rectified_advantage
 from torchrl_safe.objectives.on_policy.cup import projection_objective
 from torchrl_safe.objectives.on_policy.ipo import log_barrier
 from torchrl_safe.objectives.on_policy.p3o import exact_penalty
+from torchrl_safe.objectives.on_policy.policies import divergence
 from torchrl_safe.objectives.on_policy.surrogate import clipped_cost_surrogate
 from torchrl_safe.testing import make_actor, make_batch, make_critic, make_networks
 
@@ -711,3 +715,41 @@ def test_crpo_wraps_any_advantage_loss():
         assert not torch.equal(loss(make_batch(2))["loss_objective"], before)
     with pytest.raises(ValueError, match="normalize_advantage=True"):
         crpo(*make_networks(), normalize_advantage=True)
+
+
+@pytest.mark.parametrize("make", [FOCOPSLoss, CUPLoss])
+def test_a_masked_action_leaves_the_gradients_finite(make):
+    """PyTorch's divergence of two policies that exclude the same action has a gradient of NaN."""
+    net = TensorDictModule(torch.nn.Linear(4, 3), ["observation"], ["logits"])
+    actor = ProbabilisticActor(
+        net, ["logits", "mask"], distribution_class=MaskedCategorical, return_log_prob=True
+    )
+    loss = make(actor, make_critic(), make_critic("cost_value"), multiplier_init=1.0)
+    batch = TensorDict(
+        observation=torch.randn(8, 4),
+        mask=torch.tensor([True, True, False]).expand(8, 3),
+        advantage=torch.randn(8, 1),
+        cost_advantage=torch.randn(8, 1),
+        value_target=torch.zeros(8, 1),
+        cost_value_target=torch.zeros(8, 1),
+        batch_size=8,
+    )
+    with torch.no_grad():
+        actor(batch)
+    phases = [loss]
+    if make is CUPLoss:
+        loss.start_projection()
+        phases.append(loss.projection_loss)
+    for phase in phases:
+        losses = phase(batch)
+        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())
+
+
+def test_the_divergence_of_categories_is_pytorchs():
+    old, new = (torch.distributions.Categorical(logits=torch.randn(5, 3)) for _ in range(2))
+    assert torch.equal(divergence(old, new), kl_divergence(old, new))
+    # What the new policy excludes and the old one does not is infinitely far away.
+    excluding = torch.distributions.Categorical(probs=torch.tensor([0.5, 0.5, 0.0]))
+    everything = torch.distributions.Categorical(probs=torch.ones(3))
+    assert divergence(everything, excluding) == kl_divergence(everything, excluding) == math.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -10,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CompositeDistribution, set_composite_lp_aggregate
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Distribution, kl_divergence
+from torch.distributions import Categorical, Distribution, kl_divergence
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives.critics.cost_values import get_or_raise
@@ -119,6 +120,10 @@ def divergence(old: Distribution, new: Distribution) -> Tensor:
     if isinstance(old, CompositeDistribution) and isinstance(new, CompositeDistribution):
         parts = [divergence(part, new.dists[name]) for name, part in old.dists.items()]
         return torch.stack(parts).sum(0)
+    if isinstance(old, Categorical) and isinstance(new, Categorical):
+        # PyTorch's has a gradient of NaN where a mask excludes an action from both.
+        gap = torch.where(new.probs > 0, old.logits - new.logits, math.inf)
+        return (old.probs * torch.where(old.probs > 0, gap, 0.0)).sum(-1)
     return kl_divergence(old, new)
 
 
