@@ -257,3 +257,24 @@ def test_both_limits_are_kept(plain):
 def test_the_same_run_in_any_unit(plain, units):
     """The same multipliers, returns and costs, batch for batch, to rounding."""
     torch.testing.assert_close(train(**units), plain, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_batch_with_a_number_that_is_none_does_not_change_the_scale(value):
+    """In that column: it would be NaN for ever, and nothing would be scaled any more."""
+    past, cost = torch.tensor([2.0, 0.0]), torch.tensor([[1.0, 1.0], [value, 5.0]])
+    expected = torch.tensor([2.0, math.sqrt(8)])
+    torch.testing.assert_close(cost_advantage_scale(past, cost), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("make", [PPOLagrangianLoss, TrustRegionLoss])
+def test_costs_in_double_precision(make, dtype):
+    """NumPy's own; and networks in double precision, as TorchRL's losses take them."""
+    networks = [network.to(dtype) for network in make_networks(2)]
+    loss = make(*networks, num_costs=2)
+    batch = make_batch(2).apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    batch["next", "cost"] = batch["next", "cost"].double()
+    data = loss.estimate_advantages(batch)
+    torch.testing.assert_close(data["cost_advantage"].flatten(0, -2).std(0), torch.ones(2).double())
+    assert all(value.isfinite().all() for value in loss(data.reshape(-1)).values())

@@ -100,7 +100,7 @@ def cost_advantage_scale(
             difference is left after 34 batches.
 
     Returns:
-        The scale, shape ``(k,)``.
+        The scale, shape ``(k,)``; that of the past where the batch has a NaN or an infinity.
 
     Examples:
         >>> import torch
@@ -121,7 +121,9 @@ def cost_advantage_scale(
         values, count = torch.where(counted, values, 0.0), counted.sum(rows)
     # Unbiased, and 0 for a single step.
     current = unit * (values.square().sum(rows) / (count - 1).clamp_min(1)).sqrt()
-    return torch.maximum(current, past.lerp(current, 1 - memory))
+    past = past.to(current)
+    scale = torch.maximum(current, past.lerp(current, 1 - memory))
+    return torch.where(current.isfinite(), scale, past)  # NaN would never be forgotten.
 
 
 def standardized(
