@@ -487,6 +487,40 @@ def test_wrong_keys(transform, message):
         env.observation_spec  # noqa: B018
 
 
+class Team(CountingBatch):
+    """Three rows, each with as many agents, which have rewards of their own and share the cost."""
+
+    def __init__(self):
+        super().__init__(3)
+        agents = Composite(reward=Unbounded((3, 3, 1)), shape=(3, 3))
+        self.reward_spec = Composite(agents=agents, shape=(3,))
+
+
+@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
+def test_rewards_of_agents_are_refused(transform):
+    """They would be changed in one agent of each row, not in each agent of one row."""
+    env = TransformedEnv(Team(), CostToReward())
+    env.append_transform(transform(1.0, reward_key=("agents", "reward")))
+    message = r"reward_key must have shape \(3, 1\), .* got \(3, 3, 1\) for \('agents', 'reward'\)"
+    with pytest.raises(ValueError, match=message):
+        env.observation_spec  # noqa: B018
+
+
+@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
+def test_a_tally_that_no_reset_would_reach_is_refused(transform):
+    env = CountingBatch(2)
+    flag = Unbounded((2, 1), dtype=torch.bool)
+    flags = Composite({key: flag.clone() for key in env.done_keys}, shape=(2,))
+    env.done_spec = Composite(agents=flags, shape=(2,))
+    env = TransformedEnv(env, CostToReward())
+    keys = {}
+    if transform is EarlyTermination:
+        keys = {"terminated_key": ("agents", "terminated"), "done_key": ("agents", "done")}
+    env.append_transform(transform(1.0, **keys))
+    with pytest.raises(KeyError, match=r"out_key must stand beside done flags, .*\('agents',\)"):
+        env.observation_spec  # noqa: B018
+
+
 @pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
 def test_is_for_environments(transform):
     with pytest.raises(RuntimeError, match="append it to one"):

@@ -18,7 +18,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_safe.envs import ArmEnv, CostToReward, FrameSkip
+from torchrl_safe.envs import ArmEnv, CostToReward, EarlyTermination, FrameSkip
 from torchrl_safe.envs.gym import SafeGymEnv
 from torchrl_safe.objectives import CostTD0
 
@@ -188,6 +188,22 @@ def test_of_a_gymnasium_environment(make_env):
     for env in envs:
         cost = env.rollout(5)["next", "cost"]
         assert cost.flatten().tolist() == [0.75, 1.75, 2.75]
+
+
+def test_sums_and_budgets_may_come_before_it(make_env):
+    """They see every step: costs of 0.25, 0.5, 0.75 and 1 in the row of four steps."""
+    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
+    env = make_env(lambda: counting(3).append_transform(sums).append_transform(FrameSkip(2)))
+    check_env_specs(env)
+    rollout = env.rollout(2, break_when_any_done=False)["next"][2]
+    assert rollout["cost"].flatten().tolist() == [0.75, 1.75]
+    assert rollout["episode_cost"].flatten().tolist() == [0.75, 2.5]
+
+    early = EarlyTermination(2.0)
+    env = make_env(lambda: counting(3).append_transform(early).append_transform(FrameSkip(2)))
+    rollout = env.rollout(2, break_when_any_done=False)["next"][2]
+    assert rollout["accumulated_cost"].flatten().tolist() == [0.75, 2.5]
+    assert rollout["terminated"].flatten().tolist() == [False, True]
 
 
 @pytest.mark.parametrize("frame_skip", [0, -1, 1.5, None])

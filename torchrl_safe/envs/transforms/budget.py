@@ -79,6 +79,7 @@ class CostTally(Transform, abc.ABC):
                 f"budget must be one number or one for each of the {spec.shape[-1]} costs, got "
                 f"shape {tuple(self.budget.shape)}."
             )
+        check_column("reward_key", self.reward_key, rewards[self.reward_key], spec)
         return Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
@@ -87,6 +88,12 @@ class CostTally(Transform, abc.ABC):
         if self.out_key in (known := list(observations.keys(True, True))):
             raise KeyError(
                 f"out_key must not be among the observations {known}, got {self.out_key!r}."
+            )
+        ends = [_folder(key) for key in output_spec["full_done_spec"].keys(True, True)]
+        if not any(_folder(self.out_key)[: len(end)] == end for end in ends):
+            raise KeyError(
+                f"out_key must stand beside done flags, which are in {sorted({*ends})}, got "
+                f"{self.out_key!r}: a reset would not begin it anew."
             )
         observations[self.out_key] = self._tally_spec(output_spec["full_reward_spec"])
         return output_spec
@@ -128,3 +135,16 @@ class CostTally(Transform, abc.ABC):
         raise RuntimeError(
             f"{type(self).__name__} changes what an environment returns: append it to one."
         )
+
+
+def check_column(name: str, key: NestedKey, spec: TensorSpec, costs: TensorSpec) -> None:
+    """Raises ValueError unless there is one number for each row of costs."""
+    if spec.shape != (shape := (*costs.shape[:-1], 1)):
+        raise ValueError(
+            f"{name} must have shape {tuple(shape)}, since the costs have {tuple(costs.shape)}, "
+            f"got {tuple(spec.shape)} for {key!r}."
+        )
+
+
+def _folder(key: NestedKey) -> tuple[str, ...]:
+    return () if isinstance(key, str) else tuple(key[:-1])

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from torchrl_safe._checks import check_array
-from torchrl_safe.envs.transforms.budget import ROUNDING, CostTally
+from torchrl_safe.envs.transforms.budget import ROUNDING, CostTally, check_column
 
 
 class EarlyTermination(CostTally):
@@ -81,11 +81,15 @@ class EarlyTermination(CostTally):
         self.terminated_key, self.done_key = unravel_key(terminated_key), unravel_key(done_key)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        known = list(output_spec["full_done_spec"].keys(True, True))
+        flags, rewards = output_spec["full_done_spec"], output_spec["full_reward_spec"]
+        known = list(flags.keys(True, True))
         for name, key in (("terminated_key", self.terminated_key), ("done_key", self.done_key)):
             if key not in known:
                 raise KeyError(f"{name} must be among the done flags {known}, got {key!r}.")
-        return super().transform_output_spec(output_spec)
+        output_spec = super().transform_output_spec(output_spec)
+        for name, key in (("terminated_key", self.terminated_key), ("done_key", self.done_key)):
+            check_column(name, key, flags[key], rewards[self.cost_key])
+        return output_spec
 
     def advance(self, tally: Tensor, cost: Tensor) -> Tensor:
         return tally + cost

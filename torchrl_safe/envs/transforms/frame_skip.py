@@ -47,7 +47,9 @@ class FrameSkip(FrameSkipTransform):
             over = _is_over(next_tensordict)
             if over.all():
                 break
-            after = parent._step(tensordict)
+            # Sums, budgets and counters of earlier transforms go on from the step before.
+            before = tensordict.copy().update(next_tensordict.exclude(*parent.reward_keys))
+            after = parent._step(before)
             for key in parent.reward_keys:
                 after.set(key, next_tensordict.get(key) + after.get(key))
             next_tensordict = next_tensordict.where(over, after)
