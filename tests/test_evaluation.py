@@ -175,3 +175,17 @@ def test_table_of_hand_made_results():
         "",
         "Cost limit 0.5; brackets: 95 % confidence.",
     ]
+
+
+def test_a_module_plays_in_evaluation_mode_and_is_left_as_it_was(make_env):
+    """Dropout would be another policy, and batch norm would learn from the evaluation."""
+    env = make_env(ArmEnv, num_envs=2, max_episode_steps=3)
+    net = torch.nn.Sequential(torch.nn.BatchNorm1d(40), torch.nn.Dropout(0.5))
+    net.append(torch.nn.Linear(40, 3))
+    actor = TensorDictModule(net, ["observation"], ["action"])
+    net[1].eval()
+    before = {name: value.clone() for name, value in actor.state_dict().items()}
+    first, second = (evaluate(env, actor, 2, seed=0) for _ in range(2))
+    assert torch.equal(first["episode_reward"], second["episode_reward"])
+    assert all(torch.equal(before[name], value) for name, value in actor.state_dict().items())
+    assert [module.training for module in net] == [True, False, True]

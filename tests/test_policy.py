@@ -19,7 +19,7 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import ObservationNorm
+from torchrl.envs import GymEnv, ObservationNorm
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
     MLP,
@@ -349,6 +349,12 @@ REFUSED = {
         ValueError,
         r"observation_spec must have the key 'observation', .* got \['state'\]",
     ),
+    "batched-spec": (
+        lambda: deterministic(mlp()),
+        {"observation_spec": Composite(observation=Unbounded((4, 40)), shape=(4,))},
+        ValueError,
+        r"observation_spec must be of one observation, .* \(4,\): pass env.observation_spec_unb",
+    ),
     "nan": (broken, {}, ValueError, "actor must give finite actions, got tensor"),
     "choosy": (lambda: deterministic(Choosy()), {}, ValueError, "actor cannot be recorded: "),
     "truncated": (
@@ -387,6 +393,16 @@ def test_what_cannot_be_saved(make, changed, error, message, tmp_path):
         save_policy(path, make(), **{"observation_spec": SPEC, **changed})
     assert list(tmp_path.iterdir()) == [path]
     assert path.read_bytes() == b"before"
+
+
+def test_an_observation_without_bounds(tmp_path):
+    """CartPole's: TorchRL draws NaN where a bound is infinite."""
+    spec = GymEnv("CartPole-v1").observation_spec_unbatched
+    actor = TensorDictModule(torch.nn.Linear(4, 1), ["observation"], ["action"])
+    save_policy(tmp_path / "policy.pt", actor, spec)
+    expected = actor.module(torch.ones(4)).detach().numpy()
+    action = load_policy(tmp_path / "policy.pt")(np.ones(4, np.float32))
+    np.testing.assert_allclose(action, expected, rtol=1e-5)
 
 
 # ---------------------------------------------------------------- what is no policy

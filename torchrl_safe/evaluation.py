@@ -6,10 +6,12 @@ Needs SciPy: ``pip install "torchrl-safe[metrics]"``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -36,7 +38,10 @@ def evaluate(
     Args:
         env (EnvBase): environment, batched or not, with a ``reward`` and a ``cost``. A cost that
             is an observation becomes one with :class:`~torchrl_safe.envs.CostToReward`.
-        policy (callable): the policy: the actor that you train, or ``load_policy(...).actor``.
+            Running statistics in it change while it plays: freeze them first
+            (:meth:`VecNormV2.freeze <torchrl.envs.VecNormV2.freeze>`).
+        policy (callable): the policy: the actor that you train, or ``load_policy(...).actor``. A
+            module plays in evaluation mode, and is then put back into the mode it was in.
         episodes (int): how many episodes to play at least. A batch of environments plays all the
             episodes that it begins.
 
@@ -71,7 +76,7 @@ def evaluate(
         if name not in names and f"episode_{name}" not in names:
             raise ValueError(f"env must have the key {name!r} or 'episode_{name}', got {names}.")
     rounds = []
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with set_exploration_type(ExplorationType.DETERMINISTIC), _in_evaluation_mode(policy):
         for _ in range(math.ceil(episodes / env.batch_size.numel())):
             seed = env.set_seed(seed)
             rounds.append(_play(env, policy, max_steps))
@@ -124,6 +129,20 @@ def summarize(
         estimates[f"cost/{name}"] = mean(column)
         estimates[f"any/{name}"] = violation_rate(column, 0.0)
     return {name: torch.cat(estimate).tolist() for name, estimate in estimates.items()}
+
+
+@contextmanager
+def _in_evaluation_mode(policy: object) -> Iterator[None]:
+    """Dropout and batch norm behave as in the file that ``save_policy`` writes."""
+    modules = policy.modules() if isinstance(policy, nn.Module) else ()
+    training = [module for module in modules if module.training]
+    for module in training:
+        module.training = False
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
 
 
 def _play(

@@ -16,7 +16,7 @@ from typing import IO, Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDict
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
@@ -95,9 +95,15 @@ class Policy:
             The action, shape ``action_shape`` or ``(B, *action_shape)``.
 
         Raises:
+            TypeError: if it is given a TensorDict.
             ValueError: if the observation has another shape, cannot be converted to
                 ``observation_dtype``, or holds a NaN or an infinity.
         """
+        if isinstance(observation, TensorDictBase):
+            raise TypeError(
+                "observation must be an array, got a TensorDict: rollouts, collectors and evaluate "
+                "take policy.actor."
+            )
         given = np.asarray(observation)
         if not np.can_cast(given.dtype, self.observation_dtype, "same_kind"):
             raise ValueError(
@@ -185,6 +191,11 @@ def save_policy(
                 f"observation_spec must have the key {observation_key!r}, which the actor reads, "
                 f"got {list(spec.keys(True, True))}."
             )
+        if spec.shape:
+            raise ValueError(
+                "observation_spec must be of one observation, got one with the batch dimensions "
+                f"{tuple(spec.shape)}: pass env.observation_spec_unbatched."
+            )
         spec = spec[observation_key]
     actor = copy.deepcopy(actor).cpu().eval()
     weights = {name: _own(value) for name, value in actor.state_dict().items()}
@@ -196,6 +207,8 @@ def save_policy(
         torch.no_grad(),
     ):
         rows = spec.cpu().rand((3,))
+        if rows.is_floating_point():  # TorchRL draws no number where a bound is infinite.
+            rows = torch.where(rows.isfinite(), rows, torch.randn_like(rows))
         action, first = function(rows), function(rows[:1])
         if not action.isfinite().all():
             raise ValueError(f"actor must give finite actions, got {action[0]}.")
@@ -352,6 +365,9 @@ class _AnyBatch(torch.nn.Module):
         self.program, self.shape = program, shape
 
     def forward(self, observation: Tensor) -> Tensor:
-        batch = observation.shape[: observation.dim() - len(self.shape)]
+        dims = max(0, observation.dim() - len(self.shape))
+        batch, given = observation.shape[:dims], tuple(observation.shape[dims:])
+        if given != self.shape:
+            raise ValueError(f"observation must end in shape {self.shape}, got {given}.")
         action = self.program(observation.reshape((batch.numel(), *self.shape)).cpu())
         return action.reshape((*batch, *action.shape[1:])).to(observation.device)
