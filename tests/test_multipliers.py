@@ -265,7 +265,7 @@ def test_a_cost_that_overflows_leaves_the_optimizer_as_it_was(adam):
 )
 def test_a_cost_of_the_wrong_shape_is_refused(adam, shape):
     before = snapshot(adam)
-    named = rf"episode_cost must have shape \(E, 2\), got {re.escape(str(shape))}"
+    named = rf"shape \(E, 2\), got {re.escape(str(shape))}"
     with pytest.raises(ValueError, match=named):
         adam.step(torch.zeros(shape))
     assert_unchanged(adam, before)
@@ -306,6 +306,25 @@ RULES = {
     "pid": partial(PIDControl, pessimism=0.0),
 }
 every_rule = pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
+
+
+@every_rule
+def test_a_limit_can_be_set_later_as_it_was_made(rule):
+    names = ("collision", "speed")
+    updater = rule(make_module(0.0, 0.0), cost_limit=NAMED, cost_names=names)
+    for limit, expected in (
+        (1, [1.0, 1.0]),
+        ([3.0, 4.0], [3.0, 4.0]),
+        ({"speed": 5.0, "collision": 6.0}, [6.0, 5.0]),
+        (torch.tensor([7.0, 8.0]), [7.0, 8.0]),
+    ):
+        updater.cost_limit = limit
+        assert updater.cost_limit.tolist() == expected
+        updater.step(episodes(1.5, 2.0))
+    for limit in (NAN, torch.zeros(3), {"collision": 1.0}, "much"):
+        with pytest.raises(ValueError, match=r"^cost_limit must"):
+            updater.cost_limit = limit
+    assert updater.cost_limit.tolist() == [7.0, 8.0]
 
 
 @every_rule

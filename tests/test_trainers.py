@@ -241,7 +241,7 @@ def test_no_updater():
         (
             {"episode_cost_key": "observation"},
             ValueError,
-            r"episode_cost must have shape \(E, 2\), got \(5, 4\)",
+            r"shape \(E, 2\), got \(5, 4\)",
         ),
     ],
 )
@@ -486,6 +486,17 @@ def test_every_loss_that_one_optimizer_minimizes(make, rule):
     assert moved.sum() == pytest.approx(1)
     assert moved.min() > 0.1
     assert not any(map(torch.equal, before, loss.parameters()))
+
+
+def test_a_compiled_loss(make_arm):
+    """TorchRL's trainers take one too."""
+    arm = make_arm()
+    loss, arm.loss = arm.loss, torch.compile(arm.loss, backend="eager")
+    assert arm.safe_trainer().loss_module is arm.loss
+    plain = ClipPPOLoss(loss.actor_network, loss.critic_network)
+    arm.loss = torch.compile(plain, backend="eager")
+    with pytest.raises(TypeError, match=r"loss_module must be .* cost critic, .* got ClipPPOLoss"):
+        arm.safe_trainer()
 
 
 @pytest.mark.parametrize("make", [CUPLoss, TrustRegionLoss])

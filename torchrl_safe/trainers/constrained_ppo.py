@@ -142,6 +142,7 @@ class ConstrainedPPOTrainer(PPOTrainer):
 
 
 def _check_loss(loss_module: LossModule) -> None:
+    loss_module = getattr(loss_module, "_orig_mod", loss_module)  # What torch.compile wraps.
     if not isinstance(loss_module, CostCritic):
         raise TypeError(
             "loss_module must be an on-policy loss with a cost critic, such as PPOLagrangianLoss, "

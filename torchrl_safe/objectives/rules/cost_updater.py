@@ -42,11 +42,23 @@ class CostUpdater(abc.ABC):
         buffer = dict(loss_module.named_buffers(recurse=False)).get(self.buffer_name)
         if buffer is None:
             raise ValueError(f"{type(loss_module).__name__} has no {self.buffer_name} buffer.")
-        names = check_names(cost_names, len(buffer))
+        self.loss_module = loss_module
+        self.cost_names = check_names(cost_names, len(buffer))
+        self._has_names = cost_names is not None
+        self.cost_limit = cost_limit
+        self.pessimism = check_number("pessimism", pessimism)
+
+    @property
+    def cost_limit(self) -> Tensor:
+        """The limits, shape ``(k,)``. You can set what the constructor takes."""
+        return self._cost_limit
+
+    @cost_limit.setter
+    def cost_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> None:
+        buffer = getattr(self.loss_module, self.buffer_name)
+        numbers: Any = cost_limit
         if isinstance(cost_limit, Mapping):
-            numbers: Any = _in_order(cost_limit, None if cost_names is None else names)
-        else:
-            numbers = cost_limit
+            numbers = _in_order(cost_limit, self.cost_names if self._has_names else None)
         limit = as_tensor("cost_limit", numbers, buffer.dtype)
         if limit.shape not in ((), buffer.shape):
             raise ValueError(
@@ -55,11 +67,7 @@ class CostUpdater(abc.ABC):
             )
         if not limit.isfinite().all():
             raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
-        pessimism = check_number("pessimism", pessimism)
-        self.loss_module = loss_module
-        self.cost_names = names
-        self.cost_limit = limit.expand_as(buffer).clone()
-        self.pessimism = pessimism
+        self._cost_limit = limit.expand_as(buffer).clone()
 
     @torch.no_grad()
     def step(self, episode_cost: Tensor) -> None:
@@ -83,8 +91,8 @@ class CostUpdater(abc.ABC):
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:
             shape = tuple(episode_cost.shape)
             raise ValueError(
-                f"episode_cost must have shape (E, {len(buffer)}), got {shape}: a column for each "
-                f"of the costs {', '.join(self.cost_names)}."
+                "episode_cost must have a row for each episode that ended and a column for each of "
+                f"the costs {', '.join(self.cost_names)}, shape (E, {len(buffer)}), got {shape}."
             )
         if not (usable := episode_cost.isfinite().all(0)).all():
             raise ValueError(
@@ -138,7 +146,7 @@ class CostUpdater(abc.ABC):
                 f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "
                 f"{len(self.cost_limit)}."
             )
-        self.cost_limit = state_dict["cost_limit"].clone()
+        self.cost_limit = state_dict["cost_limit"]
         self.pessimism = state_dict["pessimism"]
 
 
