@@ -22,8 +22,19 @@ def writing(path: Path) -> Iterator[IO[bytes]]:
     try:
         with unfinished.open("wb") as file:
             yield file
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
+        publish(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def publish(written: Path, path: Path) -> None:
+    """Gives a file its name, once all of it is on the disk."""
+    with written.open("rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(written, path)
+    if os.name == "posix":  # Elsewhere a folder cannot be opened.
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import warnings
 from collections.abc import Mapping
@@ -17,8 +16,7 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-# Where a checkpoint is written before it gets its name.
-_UNFINISHED = ".unfinished"
+from torchrl_safe._files import UNFINISHED, publish
 
 
 class RunCheckpoints:
@@ -97,12 +95,12 @@ class RunCheckpoints:
         scores = {} if score is None else {"score": score}
         metadata = {"settings": self.settings, **scores}
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
-        unfinished = self.folder / _UNFINISHED
+        unfinished = self.folder / UNFINISHED
         self.folder.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(unfinished, ignore_errors=True)  # Of a process that was killed.
         try:
             written = self._checkpoint.save(unfinished / path.name, metadata=metadata)
-            _publish(written, path)
+            publish(written, path)
         except (OSError, RuntimeError) as error:
             # torch.save's error does not mention the disk.
             free = shutil.disk_usage(self.folder).free
@@ -152,7 +150,7 @@ class RunCheckpoints:
 
     def clear(self) -> None:
         """Removes all checkpoints, and nothing else that is in the folder."""
-        shutil.rmtree(self.folder / _UNFINISHED, ignore_errors=True)
+        shutil.rmtree(self.folder / UNFINISHED, ignore_errors=True)
         for path in self._files():
             path.unlink()
 
@@ -194,16 +192,3 @@ def refuse_other_settings(saved: Mapping[str, Any], settings: Mapping[str, Any])
     ]
     if differences:
         raise ValueError(f"the run has other settings: {', '.join(differences)}")
-
-
-def _publish(written: Path, path: Path) -> None:
-    """Gives a file its name, once all of it is on the disk."""
-    with written.open("rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(written, path)
-    if os.name == "posix":  # Elsewhere a folder cannot be opened.
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
