@@ -186,8 +186,9 @@ class Config:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
         if not 0 < self.gamma < 1:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
-        if self.demonstrations < 0:
-            raise ValueError(f"demonstrations must not be negative, got {self.demonstrations}.")
+        for name in ("demonstrations", "seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
         if self.demonstrations and self.action == "joint":
             raise ValueError(
                 f"demonstrations must be 0 with joint actions, got {self.demonstrations}: pilots "
@@ -248,6 +249,10 @@ class Config:
         for name in others if given else ():
             value, field = getattr(self, name), defaults[name]
             own = field.default if field.default_factory is dataclasses.MISSING else {}
+            if value != own and option == "suite_task":
+                raise ValueError(
+                    f"{name} must not be given with suite_task, which sets it, got {value}."
+                )
             if value != own:
                 raise ValueError(f"{name} must be {own} with {option}, got {value}.")
 

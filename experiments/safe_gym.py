@@ -116,6 +116,8 @@ class Config:
         for name in (*counts, "epochs", "minibatch", "random_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}.")
         for name in ("max_kl", "learning_rate", "max_grad_norm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
@@ -304,7 +306,8 @@ def make_collector(config: Config, env: EnvBase, agent: Agent) -> Collector:
 
 def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | ViolationUpdater | None:
     """Makes the updater, which tells the loss about the episode costs of each batch."""
-    wanted, limits = ALGORITHMS[config.algorithm].updater, torch.tensor(config.cost_limit)
+    wanted = ALGORITHMS[config.algorithm].updater
+    limits = torch.tensor(config.cost_limit).expand(len(config.cost_keys))
     if wanted is keep_multiplier:
         return None
     if wanted is move_multiplier:
@@ -464,9 +467,11 @@ def main(config: Config) -> dict[str, Any]:
     """Trains, evaluates, and writes the results."""
     if not config.resume and not is_new(config.out):
         raise FileExistsError(
-            f"out must be a new or empty folder, or with resume that of a run, got "
-            f"{str(config.out)!r}."
+            f"out must be a new or empty folder, got {str(config.out)!r}. To resume the run in it, "
+            "add --resume with the same options."
         )
+    if config.resume and not (config.out / "checkpoints").exists():
+        print(f"There is no run in {config.out} to resume: this begins one.")
     agent, log = train(config)
     seconds = log.seconds
     env = make_env(config)

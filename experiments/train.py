@@ -370,10 +370,12 @@ def start(config: Config) -> dict[str, Any]:
         refuse_other_settings(settings(before["config"]), settings(results["config"]))
         results["algorithms"] = before["algorithms"]
     elif not is_new(config.out):
-        raise FileExistsError(
-            f"out must be a new or empty folder, or with resume that of a run, got "
-            f"{str(config.out)!r}."
-        )
+        hint = "To resume the run in it, add --resume with the same options."
+        if config.resume:
+            hint = "There is no run in it to resume."
+        raise FileExistsError(f"out must be a new or empty folder, got {str(config.out)!r}. {hint}")
+    elif config.resume:
+        print(f"There is no run in {config.out} to resume: this begins one.")
     config.out.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(results, indent=1, default=str))
     return results

@@ -462,6 +462,7 @@ class Task(Reach):
         ({"task": Task(goal=[0.6, 0, np.nan])}, "goal must be finite"),
         ({"task": Task(reward=0.0)}, r"reward must have shape \(1,\), got \(\)"),
         ({"task": Task(success=[[True]])}, r"success must have shape \(1,\), got \(1, 1\)"),
+        ({"task": Task(success=[0.3])}, "success must be True or False for each .* dtype float64"),
         ({"observation": lambda s: {"x": s.goal[0]}}, r"observation field 'x' must have shape"),
         ({"observation": lambda s: {"x": s.contact_distance}}, "observation field 'x' must be fin"),
         ({"obstacles": Places([0.7, 0, 0])}, r"obstacle positions must have shape \(2, 3\), got"),

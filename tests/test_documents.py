@@ -10,12 +10,8 @@ import pytest
 import torch
 from programs import run_program
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torchrl.data import Composite, Unbounded
-from torchrl.modules import MLP
 
 from torchrl_safe.envs import ArmEnv, MuJoCo, NoObstacles
-from torchrl_safe.policy import save_policy
 
 ROOT = Path(__file__).parent.parent
 
@@ -156,10 +152,14 @@ def test_a_rule_of_ones_own(tmp_path):
 
 
 def test_deploying_a_policy(tmp_path):
-    """What docs/howto/deploy.md does with a file, on few episodes."""
-    actor = TensorDictModule(MLP(40, 3), ["observation"], ["action"])
-    save_policy(tmp_path / "policy.pt", actor, Composite(observation=Unbounded(40)))
-    load, drive, simulated, batched, measure = code_of("docs/howto/deploy.md")
+    """What docs/howto/deploy.md does, on few episodes."""
+    trained = """
+from tensordict.nn import TensorDictModule
+from torchrl.modules import MLP
+from torchrl_safe.envs import ArmEnv
+env, actor = ArmEnv(), TensorDictModule(MLP(40, 3), ["observation"], ["action"])
+"""
+    save, load, drive, simulated, batched, measure = code_of("docs/howto/deploy.md")
     short = measure.replace("num_envs=32", "num_envs=2").replace("256", "2")
     assert short != measure
     show = "print(action.shape, step['action'].shape, len(figures))\n"
@@ -170,7 +170,7 @@ def send_action(action): sent.append(action)
 def is_running(): return len(sent) < 4
 """
     pace = "print(len(sent), 0.15 <= time.perf_counter() - began)\n"
-    code = load + arm + drive + pace + simulated + batched + short + show
+    code = trained + save + load + arm + drive + pace + simulated + batched + short + show
     (tmp_path / "deploy.py").write_text(code, encoding="utf-8")
     assert run(tmp_path / "deploy.py", tmp_path).splitlines()[-3:] == [
         "4 True",

@@ -71,7 +71,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path, monkeypatch):
         patch.setattr(safe_gym.Log, "add", stop_in_the_fourth_batch)
         with pytest.raises(KeyboardInterrupt):
             train(stopped, progress=False)
-    with pytest.raises(FileExistsError, match="resume"):
+    with pytest.raises(FileExistsError, match=r"out must be a new or empty .* add --resume with"):
         main(stopped)
     agent, again = train(replace(stopped, resume=True), progress=False)
     assert again.rows == log.rows
@@ -137,6 +137,24 @@ def test_several_costs(tmp_path):
     for name in config.cost_keys:
         assert f"cost/{name}" in results["evaluation"]
         assert f"multiplier/{name}" in results["history"][-1]
+
+
+@pytest.mark.parametrize("algorithm", ["ppo-lagrangian", "crpo"])
+def test_one_limit_for_several_costs(make_env, algorithm):
+    keys = ("costs.fast", "costs.far")
+    config = replace(SMALL, algorithm=algorithm, cost_keys=keys, cost_limit=(0.5,))
+    env = make_env(safe_gym.make_env, config)
+    loss = safe_gym.Learner(config, make_agent(env, config.log_std), batches=1).loss
+    assert safe_gym.make_updater(config, loss).cost_limit.tolist() == [0.5, 0.5]
+
+
+def test_resuming_where_no_run_is_says_so(tmp_path, capsys):
+    config = replace(SMALL, frames=160, resume=True, out=tmp_path)
+    said = f"There is no run in {tmp_path} to resume: this begins one."
+    main(config)
+    assert said in capsys.readouterr().out
+    main(config)
+    assert said not in capsys.readouterr().out
 
 
 def test_on_our_own_arm(tmp_path):
@@ -260,6 +278,7 @@ def test_divergence_is_that_of_the_distributions(make_env):
         ({"gamma": 1.0}, "gamma must be between 0 and 1"),
         ({"max_kl": 0.0}, "max_kl must be positive"),
         ({"epochs": 0}, "epochs must be at least 1"),
+        ({"seed": -1}, "seed must not be negative, got -1"),
     ],
 )
 def test_settings_that_make_no_sense(changes, message):

@@ -1,5 +1,7 @@
 """What costs measure, in the real simulator."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from worlds import ARMS, Places, each_arm, home_of, rest, step
@@ -26,6 +28,7 @@ from torchrl_safe.envs import (
     Swing,
     Workspace,
 )
+from torchrl_safe.envs.state import Trace
 
 pytestmark = pytest.mark.usefixtures("engine")
 
@@ -115,8 +118,43 @@ def test_nothing_is_measured_unless_asked_for(make_env):
     env.reset()
     rest(env)
     assert dict(env.arm_state.trace) == {}
-    with pytest.raises(KeyError, match="'clearance' is measured only if a cost asks for it"):
-        ArmEnv(costs={"mine": lambda state: state.trace["clearance"][:, -1, 0]})
+    for name, sensing in (("clearance", "clearance=0.1"), ("ee_velocity", "tool=True")):
+        message = (
+            rf"'{name}' is measured only if a cost asks .* Sensing\({sensing}\); there is \[\]"
+        )
+        with pytest.raises(KeyError, match=message):
+            ArmEnv(costs={"mine": lambda state, name=name: state.trace[name][:, -1, 0]})
+    with pytest.raises(KeyError, match="'ee_speed' must be one of clearance, arm_approach, obsta"):
+        ArmEnv(costs={"mine": lambda state: state.trace["ee_speed"]})
+
+
+@pytest.mark.parametrize(
+    ("sensing", "measured"),
+    [
+        (Sensing(joints=True), {"joint_position"}),
+        (Sensing(tool=True), {"ee_position", "ee_velocity"}),
+        (Sensing(links=True), {"link_speed"}),
+        (Sensing(clearance=0.1), {"clearance", "arm_approach", "obstacle_approach"}),
+        (Sensing(table=True), {"table_distance"}),
+        (Sensing(itself=True), {"self_distance"}),
+    ],
+    ids=repr,
+)
+def test_what_a_cost_gets_for_what_it_asks(make_env, sensing, measured):
+    """As docs/howto/cost.md lists it, and as the error says where a cost has not asked."""
+
+    class Mine:
+        def __call__(self, state):
+            return np.zeros(len(state.time))
+
+    Mine.sensing = sensing
+    env = make_env(ArmEnv, costs={"mine": Mine()}, seed=0)
+    env.reset()
+    assert set(env.arm_state.trace) == measured
+    (asked,) = (f"{name}={value}" for name, value in asdict(sensing).items() if value)
+    for name in measured:
+        with pytest.raises(KeyError, match=asked):
+            Trace()[name]
 
 
 def test_costs_share_what_is_measured(make_env):

@@ -22,7 +22,7 @@ from experiments.film import save_film
 from experiments.learners import NoiseSchedule
 from experiments.log import summed_costs
 from experiments.report import plot_curves, table
-from experiments.train import collecting, main, make_env, train
+from experiments.train import collecting, main, make_env, start, train
 from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
 
@@ -110,9 +110,21 @@ def test_checkpoint_holds_the_loss(finished):
 def test_a_run_is_not_written_over(finished):
     out, _ = finished
     before = (out / "results.json").read_bytes()
-    with pytest.raises(FileExistsError, match="out must be a new or empty folder"):
+    with pytest.raises(FileExistsError, match=r"out must be a new or empty .* add --resume with"):
         main(Config(out=out))
     assert (out / "results.json").read_bytes() == before
+
+
+def test_resuming_where_no_run_is_says_so(tmp_path, capsys):
+    config = Config(out=tmp_path / "mistyped", resume=True)
+    start(config)
+    said = f"There is no run in {config.out} to resume: this begins one.\n"
+    assert capsys.readouterr().out == said
+    start(config)
+    assert capsys.readouterr().out == ""
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(FileExistsError, match=r"out must be .* There is no run in it to resume\."):
+        start(Config(out=tmp_path, resume=True))
 
 
 def test_help_names_the_options(capsys):
@@ -397,6 +409,7 @@ def test_noise_falls_from_batch_to_batch():
         ({"learning_rate": float("nan")}, "learning_rate must be positive, got nan"),
         ({"cost_limit": -1.0}, "cost_limit must not be negative, got -1.0"),
         ({"demonstrations": -1}, "demonstrations must not be negative, got -1"),
+        ({"seed": -1}, "seed must not be negative, got -1"),
         (
             {"demonstrations": 1, "algorithms": ("sac-lagrangian",)},
             "demonstrations must be 0 with sac-lagrangian, which learns off policy, got 1",

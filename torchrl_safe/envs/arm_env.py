@@ -490,8 +490,14 @@ class ArmEnv(EnvBase):
         shape = (self.num_envs,)
         costs = [check_array(f"cost {name!r}", c(state), shape) for name, c in self.costs.items()]
         reward = check_array("reward", self.task.reward(state), shape)
-        success = check_array("success", self.task.success(state), shape)
-        return reward[:, None], np.stack(costs, axis=1), success[:, None] > 0
+        success = self.task.success(state)
+        check_array("success", success, shape)
+        success = np.array(success)  # A copy: the task may keep its array, and change it.
+        if success.dtype != bool:  # A distance would be true nearly everywhere.
+            raise ValueError(
+                f"success must be True or False for each environment, got dtype {success.dtype}."
+            )
+        return reward[:, None], np.stack(costs, axis=1), success[:, None]
 
     def _pack(self, **arrays: np.ndarray) -> TensorDict:
         tensors = {

@@ -14,13 +14,29 @@ from torchrl_safe._checks import check_flag, check_not_negative
 Array = NDArray[np.float64]
 
 
+# What a cost asks for to have a measurement in the trace.
+_ASKED_FOR_BY = {
+    "clearance": "clearance=0.1",
+    "arm_approach": "clearance=0.1",
+    "obstacle_approach": "clearance=0.1",
+    "table_distance": "table=True",
+    "self_distance": "itself=True",
+    "joint_position": "joints=True",
+    "ee_position": "tool=True",
+    "ee_velocity": "tool=True",
+    "link_speed": "links=True",
+}
+
+
 class Trace(dict[str, Array]):
     """Measurements of every physics substep, by name; asking for a missing one says why."""
 
     def __missing__(self, name: str) -> NoReturn:
+        if name not in _ASKED_FOR_BY:
+            raise KeyError(f"{name!r} must be one of {', '.join(_ASKED_FOR_BY)}.")
         raise KeyError(
-            f"{name!r} is measured only if a cost asks for it by its `sensing` property; there is "
-            f"{list(self)}."
+            f"{name!r} is measured only if a cost asks for it with sensing = "
+            f"Sensing({_ASKED_FOR_BY[name]}); there is {list(self)}."
         )
 
 
