@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives.functional import per_step
 from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
@@ -143,19 +141,8 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         sharpness = check_number("sharpness", sharpness, positive=True)
         self.register_coeff_buffer("sharpness", sharpness, device=self.cost_critic_coeff.device)
 
-    def policy_losses(
-        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
-    ) -> TensorDictBase:
-        policy = self.evaluate(tensordict)
-        # PPO's own losses, for the reward.
-        losses = self.unconstrained(tensordict, advantage, policy)
-        # E[max(r A_c, clip(r) A_c) - A_c]
-        surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
-        # 1 - gamma
-        scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
+    def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:
         # J_c(pi_theta) - d
         violation = self.cost_violation + surrogate / scale
         # -(1 - gamma) / t log(d - J_c(pi_theta))
-        penalty = scale * log_barrier(violation, self.sharpness)
-        losses.set("loss_penalty", penalty.sum())
-        return losses
+        return scale * log_barrier(violation, self.sharpness)

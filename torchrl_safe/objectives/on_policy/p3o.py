@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives.functional import per_step
 from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
@@ -132,17 +130,6 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
         device = self.cost_critic_coeff.device
         self.register_coeff_buffer("penalty_coeff", penalty_coeff, device=device)
 
-    def policy_losses(
-        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
-    ) -> TensorDictBase:
-        policy = self.evaluate(tensordict)
-        # PPO's own losses, for the reward.
-        losses = self.unconstrained(tensordict, advantage, policy)
-        # E[max(r A_c, clip(r) A_c) - A_c]
-        surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
-        # 1 - gamma
-        scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
+    def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:
         # kappa max(0, surrogate + (1 - gamma) (J_c - d))
-        penalty = exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)
-        losses.set("loss_penalty", penalty.sum())
-        return losses
+        return exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)

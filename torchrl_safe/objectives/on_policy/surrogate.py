@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe.objectives._checks import check_episode_length, check_length_known
 from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.functional import per_step
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO, Policy
 
 
@@ -45,7 +47,7 @@ def clipped_cost_surrogate(
 
 
 class CostSurrogate(ConstrainedPPO):
-    """Brings the mean surrogates of the costs to a loss that penalizes them."""
+    """PPO's losses, and a penalty on the mean surrogates of the costs."""
 
     cost_buffers = ("cost_violation",)
     policy_out_keys = ("loss_penalty",)
@@ -59,6 +61,28 @@ class CostSurrogate(ConstrainedPPO):
                 f"{self.reduction!r}."
             )
         self._asymmetric = isinstance(kwargs.get("clip_epsilon"), tuple | list)
+
+    @abc.abstractmethod
+    def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:
+        """Returns the penalty of each cost, shape ``(k,)``.
+
+        Args:
+            surrogate (Tensor): what :meth:`cost_surrogate` returns, shape ``(k,)``.
+            scale (Tensor or float): the share of one step in an episode (:func:`per_step`).
+        """
+
+    def policy_losses(
+        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
+    ) -> TensorDictBase:
+        policy = self.evaluate(tensordict)
+        # PPO's own losses, for the reward.
+        losses = self.unconstrained(tensordict, advantage, policy)
+        # E[max(r A_c, clip(r) A_c) - A_c]
+        surrogate = self.cost_surrogate(tensordict, policy, cost_advantage)
+        # 1 - gamma
+        scale = per_step(self.episode_length, self.cost_value_estimator.gamma)
+        losses.set("loss_penalty", self.penalty(surrogate, scale).sum())
+        return losses
 
     def cost_surrogate(
         self, tensordict: TensorDictBase, policy: Policy, cost_advantage: Tensor
