@@ -57,7 +57,7 @@ class MultiplierUpdater(CostUpdater):
         >>> import torch
         >>> class Exponentiated(MultiplierUpdater):
         ...     def next_multiplier(self, multiplier, violation):
-        ...         # By a factor of 1.2 at most. The lower bound lets it start from 0.
+        ...         # By a factor of at most 1.22. From 0 it could not rise: at least 0.01.
         ...         step = 0.2 * (violation / self.cost_limit).clamp(-1, 1)
         ...         return multiplier.clamp_min(0.01) * step.exp()
         >>> loss = LossModule()
