@@ -291,6 +291,18 @@ def test_between_two_that_are_too_near_it_brakes(make_env, engine, turntable):
     assert after["shield_correction"].item() == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("action", [1.0, -1.0])
+def test_with_half_of_its_margin_gone_an_arm_only_withdraws(make_env, engine, turntable, action):
+    """By hand: 13 mm of 20 are gone, at a lever of 0.45 m. What is asked for does not matter."""
+    env = turn(make_env, turntable, (0.45, 0.157, 0.5), action=action)
+    assert env.arm_state.shield_braked[0]
+    assert env.arm_state.joint_position[0, 0] == pytest.approx(-SHARE * 0.013 / 0.45, rel=0.1)
+    # With 7 mm gone it does what leads away, as fast as the motors follow near an obstacle.
+    state = turn(make_env, turntable, (0.45, 0.163, 0.5), action=-1.0).arm_state
+    assert not state.shield_braked[0]
+    assert state.joint_position[0, 0] == pytest.approx(-10 * 0.05**2, rel=0.05)
+
+
 def test_the_tool_stays_in_its_workspace(make_env, engine):
     region = Region((0.2, -0.1, 0.1), (0.5, 0.1, 0.4))
     shield = Shield(workspace=region)

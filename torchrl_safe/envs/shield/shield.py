@@ -35,7 +35,8 @@ class Shielded(NamedTuple):
     joints: Array
     #: Finger targets, m: those asked for, or where the fingers are.
     fingers: Array
-    #: Which worlds brake because nothing that was asked for is safe, ``(N,)``.
+    #: Which worlds brake because nothing that was asked for is safe or the arm is pressed on
+    #: something, ``(N,)``.
     braked: NDArray[np.bool_]
 
 
@@ -107,7 +108,8 @@ class Shield:
 
     If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
     motion that does not use up more than all the room. If there is none, it stands still, or gives
-    way to what comes as far as what stands allows.
+    way to what comes as far as what stands allows. An arm with less than half of a margin left
+    brakes too: it only withdraws, whatever is asked for.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -201,8 +203,9 @@ class Shield:
         angles, held = state.joint_position, state.finger_position
         opening = fingers - held if fingers.shape[1] else np.zeros_like(held)
         step = _Step(state, simulator, duration, 1 - np.exp(-self.rate * duration))
-        asked = joints - angles
         now = self._measure(step, np.arange(len(angles)), angles, held)
+        pressed = self._is_pressed(state, now)
+        asked = np.where(pressed[:, None], 0.0, joints - angles)
         lower, upper = self._bounds(step, now, longest)
         least = self._least(step, now)
         if opening.any():
@@ -241,7 +244,7 @@ class Shield:
                 lower[again],
                 upper[again],
             )
-        still = ~solved[:, None]
+        still, braked = ~solved[:, None], braked | pressed
         if fingers.shape[1]:
             fingers = np.where(braked[:, None], held, fingers)
         return Shielded(np.where(still, angles, angles + change), fingers, braked)
@@ -274,6 +277,15 @@ class Shield:
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         spare = self._spare(step, room, joints)
         return _Pairs(room, spare, closing, joints, moved, near.other)
+
+    def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
+        """Which arms have less than half of a margin left, ``(N,)``.
+
+        They press on something, so motors do not follow: the friction of a cube under the hand can
+        hold the arm to an obstacle.
+        """
+        table = now.other == state.obstacle_position.shape[1]
+        return (now.room < -np.where(table, self.table, self.margin) / 2).any(axis=1)
 
     def _spare(self, step: _Step, room: Array, joints: Array) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
