@@ -285,7 +285,8 @@ class Shield:
         hold the arm to an obstacle.
         """
         table = now.other == state.obstacle_position.shape[1]
-        return (now.room < -np.where(table, self.table, self.margin) / 2).any(axis=1)
+        least = -np.where(table, self.table, self.margin) / 2
+        return np.any(now.room < least, axis=1)
 
     def _spare(self, step: _Step, room: Array, joints: Array) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
