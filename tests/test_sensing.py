@@ -138,7 +138,7 @@ def test_nothing_is_measured_unless_asked_for(make_env):
         (Sensing(table=True), {"table_distance"}),
         (Sensing(itself=True), {"self_distance"}),
     ],
-    ids=repr,
+    ids=["joints", "tool", "links", "clearance", "table", "itself"],
 )
 def test_what_a_cost_gets_for_what_it_asks(make_env, sensing, measured):
     """As docs/howto/cost.md lists it, and as the error says where a cost has not asked."""
