@@ -88,7 +88,7 @@ def test_the_transforms_need_no_simulator():
         ("policy", {"_files", "_program"}),
         ("evaluation", {"_checks", "metrics"}),
         ("metrics", set()),
-        ("checkpoint", set()),
+        ("checkpoint", {"_files"}),
         ("collectors", set()),
     ],
 )

@@ -241,7 +241,7 @@ def test_other_settings_are_refused(tmp_path, uninterrupted):
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(FileExistsError, match="or with resume that of a run"):
+    with pytest.raises(FileExistsError, match="There is no run in it to resume"):
         main(Config(out=tmp_path, resume=True))
 
 
