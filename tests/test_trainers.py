@@ -241,7 +241,7 @@ def test_no_updater():
         (
             {"episode_cost_key": "observation"},
             ValueError,
-            r"shape \(E, 2\), got \(5, 4\)",
+            r"episode_cost must have a row .* shape \(E, 2\), got \(5, 4\)",
         ),
     ],
 )

@@ -82,14 +82,13 @@ class EarlyTermination(CostTally):
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         flags, rewards = output_spec["full_done_spec"], output_spec["full_reward_spec"]
+        transformed = super().transform_output_spec(output_spec)
         known = list(flags.keys(True, True))
         for name, key in (("terminated_key", self.terminated_key), ("done_key", self.done_key)):
             if key not in known:
                 raise KeyError(f"{name} must be among the done flags {known}, got {key!r}.")
-        output_spec = super().transform_output_spec(output_spec)
-        for name, key in (("terminated_key", self.terminated_key), ("done_key", self.done_key)):
             check_column(name, key, flags[key], rewards[self.cost_key])
-        return output_spec
+        return transformed
 
     def advance(self, tally: Tensor, cost: Tensor) -> Tensor:
         return tally + cost
