@@ -108,7 +108,7 @@ class CountingBatch(EnvBase):
     def _reset(self, tensordict=None, **kwargs):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self.count, dtype=torch.bool) if mask is None else mask
-        self.count = torch.where(mask, 0.0, self.count)
+        self.count = torch.where(mask.view_as(self.count), 0.0, self.count)
         return self._observe()
 
     def _step(self, tensordict):

@@ -95,7 +95,7 @@ class CostTally(Transform, abc.ABC):
                 f"out_key must stand beside done flags, which are in {sorted({*ends})}, got "
                 f"{self.out_key!r}: a reset would not begin it anew."
             )
-        observations[self.out_key] = self._tally_spec(output_spec["full_reward_spec"])
+        self._add_tally(observations, output_spec["full_reward_spec"])
         return output_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -104,21 +104,39 @@ class CostTally(Transform, abc.ABC):
         states = input_spec["full_state_spec"]
         if states is None:
             states = Composite(shape=input_spec.shape, device=input_spec.device)
-        states[self.out_key] = self._tally_spec(self.parent.full_reward_spec)
+        self._add_tally(states, self.parent.full_reward_spec)
         input_spec["full_state_spec"] = states
         return input_spec
+
+    def _add_tally(self, specs: Composite, rewards: Composite) -> None:
+        spec, folder = self._tally_spec(rewards), _folder(self.out_key)
+        for depth in range(1, len(folder) + 1):  # A new group would not get the batch of agents.
+            if folder[:depth] not in specs.keys(True):
+                specs[folder[:depth]] = Composite(shape=spec.shape[:-1], device=spec.device)
+        specs[self.out_key] = spec
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        reset, tally = tensordict.get("_reset", None), tensordict.get(self.out_key, None)
+        reset, tally = self._reset_mask(tensordict), tensordict.get(self.out_key, None)
         if tally is None:  # All rows begin then; those outside a mask are put back by reset.
             tally = self._tally_spec(self.parent.full_reward_spec).zero() + self.start
         elif reset is None:
             tally = torch.full_like(tally, self.start)
         else:
+            # A mask has the batch of the environment, of its agents, or a last dimension of 1.
+            reset = reset.reshape(*reset.shape, *(1,) * (tally.ndim - reset.ndim))
             tally = torch.where(reset, self.start, tally)
         return tensordict_reset.set(self.out_key, tally)
+
+    def _reset_mask(self, tensordict: TensorDictBase) -> Tensor | None:
+        """The mask that stands nearest to the tally: agents may have one of their own."""
+        folder = _folder(self.out_key)
+        for depth in range(len(folder), -1, -1):
+            mask = tensordict.get((*folder[:depth], "_reset"), None)
+            if mask is not None:
+                return mask
+        return None
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         before = tensordict.get(self.out_key, None)

@@ -72,6 +72,7 @@ class CostToReward(Transform):
                 )
             columns += shape[-1] if len(shape) > len(batch) else 1
             del observations[key]
+            _remove_empty(observations, key)
         out_key = self.out_keys[0]
         if out_key in (known := list(rewards.keys(True, True))):
             raise KeyError(f"out_keys must not be among the rewards {known}, got {out_key!r}.")
@@ -84,14 +85,27 @@ class CostToReward(Transform):
         dims = next_tensordict.batch_dims
         costs = [next_tensordict.get(key).to(torch.float32) for key in self.in_keys]
         columns = [cost if cost.ndim > dims else cost.unsqueeze(-1) for cost in costs]
-        return next_tensordict.exclude(*self.in_keys).set(
+        return self._without_costs(next_tensordict).set(
             self.out_keys[0], torch.cat(columns, dim=-1)
         )
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return tensordict_reset.exclude(*self.in_keys)
+        return self._without_costs(tensordict_reset)
+
+    def _without_costs(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = tensordict.exclude(*self.in_keys)
+        for key in self.in_keys:
+            _remove_empty(tensordict, key)
+        return tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         raise RuntimeError("CostToReward changes what an environment returns: append it to one.")
+
+
+def _remove_empty(groups: Composite | TensorDictBase, key: NestedKey) -> None:
+    """Removes the groups that a removed key leaves empty, in place."""
+    for depth in range(len(key) - 1, 0, -1) if isinstance(key, tuple) else ():
+        if key[:depth] in groups.keys(True) and groups[key[:depth]].is_empty():
+            del groups[key[:depth]]
