@@ -203,6 +203,20 @@ def test_a_full_disk_leaves_the_one_before(run, net):
     assert weight_after_load(run, net) == [1]
 
 
+def test_an_error_of_a_component_is_its_own(run, net):
+    """Not one of the disk."""
+
+    class Closed(torch.nn.Module):
+        def state_dict(self):
+            raise RuntimeError("This arm is closed.")
+
+    save(run, net, 1)
+    other = RunCheckpoints(run.folder, {"net": net, "arm": Closed()}, settings=run.settings)
+    with pytest.raises(RuntimeError, match=r"^This arm is closed\.$"):
+        other.save(2)
+    assert run.load() == 1
+
+
 def test_what_a_killed_process_left_is_cleared_away(run, net):
     save(run, net, 1)
     left = run.folder / ".unfinished" / "checkpoint-000000000002.torchrl"

@@ -8,7 +8,14 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import Compose, GymEnv, RewardSum, SerialEnv, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    GymEnv,
+    ParallelEnv,
+    RewardSum,
+    SerialEnv,
+    TransformedEnv,
+)
 
 from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import (
@@ -268,7 +275,12 @@ def two_with_transforms():
     return SerialEnv(2, [partial(make_training_env, 1)] * 2)
 
 
-@pytest.mark.parametrize("make", [pendulum, two_with_transforms])
+def two_processes():
+    two = ParallelEnv(2, partial(ArmEnv, num_envs=1), mp_start_method="fork")
+    return TransformedEnv(two, RewardSum(["reward"]))
+
+
+@pytest.mark.parametrize("make", [pendulum, two_with_transforms, two_processes])
 def test_environments_without_a_state_begin_anew(make):
     """Sums and observations too, which would otherwise be those of another episode."""
     settings = {**SETTINGS, "frames_per_batch": 10}
@@ -286,6 +298,7 @@ def test_environments_without_a_state_begin_anew(make):
         batch = next(iter(two)).reshape(-1, 10 // (1 if make is pendulum else 2))
         sums, rewards = batch["next", "episode_reward"], batch["next", "reward"]
         torch.testing.assert_close(sums[:, 0], rewards[:, 0])
+        assert rewards.all()  # None is of a step that was not there yet.
     finally:
         one.shutdown()
         two.shutdown()

@@ -6,6 +6,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -72,10 +73,7 @@ class RunCheckpoints:
         self._rotation = CheckpointRotation(
             self.folder, keep_last=keep_last, keep_best=("score", "max")
         )
-        self._checkpoint = Checkpoint(format="archive")
-        for name, component in components.items():
-            adapter = StateDictCheckpointAdapter("torch")
-            self._checkpoint.register(name, component, adapter=adapter)
+        self._components = dict(components)
 
     def save(self, step: int, *, score: float | None = None) -> Path:
         """Saves all components.
@@ -90,8 +88,9 @@ class RunCheckpoints:
 
         Raises:
             OSError: if it could not be written, for example because the disk is full; those
-                before are intact.
+                before are intact. What a ``state_dict`` raises is raised as it is.
         """
+        taken = {name: _Taken(part.state_dict()) for name, part in self._components.items()}
         scores = {} if score is None else {"score": score}
         metadata = {"settings": self.settings, **scores}
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
@@ -99,7 +98,7 @@ class RunCheckpoints:
         self.folder.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(unfinished, ignore_errors=True)  # Of a process that was killed.
         try:
-            written = self._checkpoint.save(unfinished / path.name, metadata=metadata)
+            written = _checkpoint_of(taken).save(unfinished / path.name, metadata=metadata)
             publish(written, path)
         except (OSError, RuntimeError) as error:
             # torch.save's error does not mention the disk.
@@ -165,8 +164,25 @@ class RunCheckpoints:
                 raise CheckpointError(
                     f"component {name!r} is not what this class writes, but {component['files']}"
                 )
-        self._checkpoint.load(path, map_location=map_location)
+        _checkpoint_of(self._components).load(path, map_location=map_location)
         return int(path.stem.removeprefix("checkpoint-"))
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A component whose state has been taken: errors of that are none of the disk."""
+
+    state: Any
+
+    def state_dict(self) -> Any:
+        return self.state
+
+
+def _checkpoint_of(components: Mapping[str, Any]) -> Checkpoint:
+    checkpoint = Checkpoint(format="archive")
+    for name, component in components.items():
+        checkpoint.register(name, component, adapter=StateDictCheckpointAdapter("torch"))
+    return checkpoint
 
 
 def refuse_other_settings(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 
 
 class ResumableCollector(Collector):
@@ -26,9 +26,12 @@ class ResumableCollector(Collector):
     A collector that loads a state from between two batches collects what the saved one would have
     collected, bit for bit. The environment needs a complete ``state_dict``, as
     :class:`~torchrl_safe.envs.ArmEnv` has; any transforms may be around it. Environments whose
-    state has no ``get_extra_state`` in it begin their episodes anew. It also works in worker
-    processes, as the ``collector_class`` of :class:`~torchrl.collectors.MultiSyncCollector`
-    (trajectories may have other numbers there).
+    state has no ``get_extra_state`` in it, and those in a :class:`~torchrl.envs.ParallelEnv`, begin
+    their episodes anew. It also works in worker processes, as the ``collector_class`` of
+    :class:`~torchrl.collectors.MultiSyncCollector` (trajectories may have other numbers there).
+
+    After the last of ``total_frames`` a collector closes its environment, which then has no state.
+    To save after the last batch, pass ``total_frames=-1`` and stop the loop yourself.
 
     Arguments are those of :class:`~torchrl.collectors.Collector`.
 
@@ -58,8 +61,9 @@ class ResumableCollector(Collector):
     def state_dict(self) -> OrderedDict:
         """Returns the state between two batches."""
         state = super().state_dict()
-        simulator = _innermost(self.env).state_dict()
-        if _is_complete(simulator):
+        env = _innermost(self.env)
+        # A ParallelEnv reads its first step after a load before it is there (TorchRL 0.14.1).
+        if not isinstance(env, ParallelEnv) and _is_complete(simulator := env.state_dict()):
             state["base_env_state_dict"] = simulator
             state["carrier"] = self._carrier.exclude("next").clone().to_dict()
         # Tensors only: workers send their state as a TensorDict.
