@@ -17,6 +17,7 @@ from tensordict.nn import (
 from tensordict.utils import unravel_key
 from torch import nn
 from torch.nn.functional import smooth_l1_loss
+from torchrl.collectors.utils import split_trajectories
 from torchrl.modules import IndependentNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss, SoftUpdate
 from torchrl.objectives.value import GAE
@@ -372,6 +373,40 @@ def test_advantages_are_those_of_the_steps_that_count(key):
     ratio = (kept.numel() / (kept.numel() - 1)) ** 0.5
     torch.testing.assert_close(kept, expected["advantage"] * ratio)
     assert "shifted_valid" not in padded
+
+
+@pytest.mark.parametrize("time_dim", [None, 0])
+def test_what_pads_a_trajectory_changes_no_target(time_dim):
+    """Not even where the end of the batch cut it, so that it is not done."""
+    batch = make_batch(2)
+    done = batch["next", "done"].squeeze(-1)
+    before = torch.nn.functional.pad(done[:, :-1], (1, 0))
+    rows = torch.arange(len(batch))[:, None] * batch.shape[1]
+    batch["collector", "traj_ids"] = before.long().cumsum(1) + rows
+
+    def loss():
+        torch.manual_seed(0)
+        loss = PPOLagrangianLoss(*make_networks(2), num_costs=2)
+        loss.make_value_estimator(time_dim=time_dim)
+        return loss.make_cost_value_estimator(time_dim=time_dim)
+
+    split = split_trajectories(batch.clone(), trajectory_key=("collector", "traj_ids"))
+    assert split["next", "done"].any(1).logical_not().any()  # Some are cut.
+    ends = split["next", "done"].clone()
+    if time_dim == 0:
+        whole = loss().estimate_advantages(batch.transpose(0, 1).contiguous()).transpose(0, 1)
+        split = loss().estimate_advantages(split.transpose(0, 1).contiguous()).transpose(0, 1)
+    else:
+        whole, split = (loss().estimate_advantages(data) for data in (batch, split))
+    assert torch.equal(split["next", "done"], ends)
+    counts = split["collector", "mask"]
+
+    def in_order(data, key):
+        return data[key][data["observation"][:, 0].argsort()]
+
+    for key in ("value_target", "cost_value_target"):
+        one, other = in_order(whole.reshape(-1), key), in_order(split[counts], key)
+        torch.testing.assert_close(one, other)
 
 
 def test_one_advantage_without_the_other_is_refused():

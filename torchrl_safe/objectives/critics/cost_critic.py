@@ -111,10 +111,11 @@ class CostCritic(CostValues):
 
         It scales them over the whole batch with
         :func:`~torchrl_safe.objectives.scaled_advantages`. The reward advantage is standardized,
-        unless the loss has an ``advantage_norm``, which scales it instead. The cost advantages are
-        centred and, with ``normalize_cost_advantage``, divided by a scale that the loss keeps from
-        batch to batch. Steps that the loss leaves out, such as those that pad a trajectory
-        (``("collector", "mask")``), do not count.
+        unless the loss has an ``advantage_norm``, which scales it instead (as TorchRL asks, update
+        it yourself, once for each batch). The cost advantages are centred and, with
+        ``normalize_cost_advantage``, divided by a scale that the loss keeps from call to call.
+        Steps that the loss leaves out, such as those that pad a trajectory
+        (``("collector", "mask")``), do not count: neither here nor in the advantages of others.
 
         If you call the loss with a batch that has no advantages, it does the same first.
 
@@ -136,7 +137,7 @@ class CostCritic(CostValues):
         keys = self.tensor_keys
         cost_key = unravel_key(("next", keys.cost))
         self._check_width(cost_key, get_or_raise(tensordict, cost_key))
-        data = self._with_features(tensordict)
+        data = self._with_ends(self._with_features(tensordict))
         self.value_estimator(
             data,
             params=self.critic_network_params.detach() if self.functional else None,
@@ -160,7 +161,8 @@ class CostCritic(CostValues):
         data.set(keys.advantage, advantage)
         data.set(keys.cost_advantage, cost_advantage)
         if data is not tensordict:
-            hidden = [*self._shared_keys, *(unravel_key(("next", k)) for k in self._shared_keys)]
+            changed = [*self._shared_keys, keys.done]
+            hidden = [*self._shared_keys, *(unravel_key(("next", key)) for key in changed)]
             tensordict.update(data.exclude(*hidden))
 
     def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
@@ -187,6 +189,22 @@ class CostCritic(CostValues):
         for part in (data, data.get("next")):
             part.update(self.actor_features(part))
         return data
+
+    def _with_ends(self, data: TensorDictBase) -> TensorDictBase:
+        """The batch, with trajectories that end where the next step does not count.
+
+        To an estimator what pads a trajectory would be what followed.
+        """
+        key = unravel_key(("next", self.tensor_keys.done))
+        done = get_or_raise(data, key)
+        mask = counted(self, data, done)
+        if mask is None:
+            return data
+        time = getattr(self.value_estimator, "time_dim", None)  # Not all of TorchRL's have it.
+        if time is None:
+            time = data.names.index("time") if "time" in data.names else data.ndim - 1
+        follows = mask.roll(-1, time % data.ndim)
+        return data.clone(False).set(key, done | (mask & ~follows))
 
     def _check_width(self, key: NestedKey, values: Tensor) -> None:
         if values.shape[-1] != self.num_costs:
