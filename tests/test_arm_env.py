@@ -422,6 +422,23 @@ def test_action_must_have_its_shape(make_env, shape):
         step(env, torch.zeros(shape))
 
 
+def test_action_may_be_of_any_precision(make_env):
+    env = make_env(ArmEnv, num_envs=1)
+    action = torch.full((1, 3), 0.5)
+    seen = []
+    for dtype in (torch.float32, torch.bfloat16):
+        env.set_seed(0)
+        env.reset()
+        seen.append(step(env, action.to(dtype))["observation"])
+    assert torch.equal(*seen)  # A half has no other value in any of them.
+
+
+def test_a_missing_action_is_named(make_env):
+    env = make_env(ArmEnv, num_envs=1)
+    with pytest.raises(KeyError, match="action"):
+        env.step(env.reset())
+
+
 class Task(Reach):
     """A task that returns whatever it is given."""
 

@@ -352,7 +352,9 @@ class Crew(EnvBase):
 AGENTS = {"cost_key": ("agents", "cost"), "reward_key": ("agents", "reward")}
 
 
-@pytest.mark.parametrize("kind, ends_by_agent", [("saute", False), ("saute", True), ("early", True)])
+@pytest.mark.parametrize(
+    ("kind", "ends_by_agent"), [("saute", False), ("saute", True), ("early", True)]
+)
 def test_each_agent_has_a_tally(kind, ends_by_agent):
     keys = {**AGENTS, "out_key": ("agents", "tally")}
     if kind == "saute":

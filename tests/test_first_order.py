@@ -326,6 +326,17 @@ def test_without_discount_the_length_of_an_episode_must_be_given(kind):
             build(kind, episode_length=value)
 
 
+@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss, CUPLoss])
+def test_a_discount_that_is_loaded_is_checked_too(kind):
+    saved = build(kind).state_dict()
+    name = next(name for name in saved if name.endswith("cost_value_estimator.gamma"))
+    saved[name] = torch.ones_like(saved[name])
+    with pytest.raises(ValueError, match="gamma"):
+        build(kind).load_state_dict(saved)
+    if kind is not CUPLoss:
+        build(kind, episode_length=40).load_state_dict(saved)
+
+
 def test_the_length_of_an_episode_says_what_a_step_is_worth():
     """40 steps at gamma 0.99, which stands for 100: the effect is 2.5 times too large."""
     default, true = build(P3OLoss), build(P3OLoss, episode_length=40)

@@ -412,6 +412,13 @@ def test_normalized_limits_are_not_negative():
     DualAscent(make_module(0.0), cost_limit=-1.0, lr=0.1)
     with pytest.raises(ValueError, match="cost_limit must not be negative with normalize, got -1"):
         DualAscent(make_module(0.0), cost_limit=-1.0, lr=0.1, normalize=True)
+    updater = DualAscent(make_module(0.0), cost_limit=1.0, lr=0.1, normalize=True)
+    with pytest.raises(ValueError, match="cost_limit must not be negative with normalize, got "):
+        updater.cost_limit = -1.0
+    assert updater.cost_limit == 1.0
+    plain = DualAscent(make_module(0.0), cost_limit=-1.0, lr=0.1)
+    updater.load_state_dict(plain.state_dict())  # With its option.
+    assert not updater.normalize
 
 
 def test_a_loss_without_the_buffer_is_refused():

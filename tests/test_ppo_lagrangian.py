@@ -430,6 +430,21 @@ def test_a_cost_critic_that_does_not_fit_is_refused():
         astray(data)
 
 
+def test_advantages_need_a_critic_of_the_reward():
+    actor, _, cost_critic = make_networks()
+    loss = PPOLagrangianLoss(actor, None, cost_critic)
+    with pytest.raises(ValueError, match="critic_network must be given to estimate advantages"):
+        loss.estimate_advantages(make_batch())
+
+
+def test_a_mask_must_be_bool():
+    batch = make_batch()
+    batch["collector", "mask"] = torch.ones(*batch.shape, 1)
+    message = r"mask \('collector', 'mask'\) must be bool, got torch\.float32"
+    with pytest.raises(ValueError, match=message):
+        make_loss().estimate_advantages(batch)
+
+
 def test_explained_variance_can_be_left_out():
     loss = make_loss(log_explained_variance=False)
     losses = loss(estimated(loss))

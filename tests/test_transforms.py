@@ -125,7 +125,9 @@ def test_is_for_environments():
 def test_a_group_that_becomes_empty_is_gone(make_env):
     """Left empty, it would stand in what reset returns and not in the specs."""
     keys = [("costs", "heat"), ("costs", "wear")]
-    env = make_env(moved, CountingBatch(2, costs=dict.fromkeys(keys, (2,))), keys, [("costs", "all")])
+    env = make_env(
+        moved, CountingBatch(2, costs=dict.fromkeys(keys, (2,))), keys, [("costs", "all")]
+    )
     check_env_specs(env)
     assert "costs" not in env.reset()
     collector = Collector(env, frames_per_batch=8, total_frames=8)

@@ -776,6 +776,22 @@ def test_other_bad_losses_are_refused():
         TrustRegionStep(loss)
 
 
+@pytest.mark.parametrize("functional", [True, False])
+@pytest.mark.parametrize("separate", [True, False])
+@pytest.mark.parametrize("kind", ["reward", "cost"])
+def test_a_critic_that_the_step_would_move_is_refused(kind, separate, functional):
+    actor, critic, cost_critic = make_networks()
+    first = next(module for module in actor.modules() if isinstance(module, nn.Linear))
+    shared = {"reward": critic, "cost": cost_critic}[kind]
+    next(
+        module for module in shared.modules() if isinstance(module, nn.Linear)
+    ).weight = first.weight
+    networks = actor, critic, cost_critic
+    loss = TrustRegionLoss(*networks, separate_losses=separate, functional=functional)
+    with pytest.raises(ValueError, match="must not share parameters with a critic"):
+        TrustRegionStep(loss)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -106,7 +106,6 @@ class ArmEnv(EnvBase):
 
     # The substeps are taken here: TorchRL must not add a FrameSkipTransform.
     _has_frame_skip = True
-    _supports_set_state = False
 
     def __init__(
         self,
@@ -293,7 +292,7 @@ class ArmEnv(EnvBase):
         self._check_open()
         if not self._begun:
             raise RuntimeError("ArmEnv must be reset before its first step.")
-        action = self._check_action(tensordict.get("action"))
+        action = self._check_action(tensordict["action"])
         joints, fingers = self.action_mode.targets(action, self._state, self._simulator)
         if self.scene.motor_limits:
             joints, fingers = self._within_speed(joints, fingers)
@@ -425,7 +424,7 @@ class ArmEnv(EnvBase):
             raise ValueError(f"action must have shape {tuple(shape)}, got {tuple(action.shape)}.")
         if action.is_complex():
             raise ValueError(f"action must be real, got {action.dtype}.")
-        array = action.numpy(force=True).astype(float)
+        array = action.detach().to("cpu", torch.float64).numpy()
         if not np.isfinite(array).all():
             rows = np.flatnonzero(~np.isfinite(array).all(axis=1)).tolist()
             raise ValueError(f"action must be finite, got NaN or infinity in rows {rows}.")

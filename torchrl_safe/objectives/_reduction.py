@@ -12,8 +12,12 @@ def counted(loss: LossModule, tensordict: TensorDictBase, values: Tensor) -> Ten
     """The steps that a loss counts, expanded to the shape of the values, or None if all."""
     key = loss.loss_mask_key
     keys = AUTO_LOSS_MASK_KEYS if key == "auto" else () if key is None else (key,)
-    found = [tensordict.get(key, None) for key in keys]
-    masks = [expanded_mask(mask, values) for mask in found if mask is not None]
+    masks = []
+    for key in keys:
+        if (mask := tensordict.get(key, None)) is not None:
+            if mask.dtype is not torch.bool:
+                raise ValueError(f"The mask {key!r} must be bool, got {mask.dtype}.")
+            masks.append(expanded_mask(mask, values))
     return torch.stack(masks).all(0) if masks else None
 
 

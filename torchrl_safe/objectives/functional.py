@@ -97,7 +97,7 @@ def cost_advantage_scale(
 
     Keyword Args:
         memory (float, optional): the share m of the past. Defaults to ``0.98``: half of a
-            difference is left after 34 batches.
+            difference is left after 34 calls.
 
     Returns:
         The scale, shape ``(k,)``; that of the past where the batch has a NaN or an infinity.

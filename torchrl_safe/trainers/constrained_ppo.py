@@ -21,8 +21,9 @@ class ConstrainedPPOTrainer(PPOTrainer):
 
     It is :class:`~torchrl.trainers.algorithms.PPOTrainer` with a :class:`MultiplierHook`, and with
     ``loss_module.estimate_advantages`` in place of its GAE. Like ``PPOTrainer`` it estimates
-    advantages anew in each epoch, with the current critics. TorchRL warns that its trainers are
-    experimental.
+    advantages anew in each epoch, with the current critics, so the scale of the cost advantages
+    (:func:`~torchrl_safe.objectives.cost_advantage_scale`) forgets with each epoch, not with each
+    batch. TorchRL warns that its trainers are experimental.
 
     Keyword Args:
         loss_module (LossModule): :class:`~torchrl_safe.objectives.PPOLagrangianLoss`,

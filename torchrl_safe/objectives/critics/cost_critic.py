@@ -135,6 +135,8 @@ class CostCritic(CostValues):
 
     def _estimate_advantages(self, tensordict: TensorDictBase) -> None:
         keys = self.tensor_keys
+        if self.critic_network is None:
+            raise ValueError("critic_network must be given to estimate advantages, got None.")
         cost_key = unravel_key(("next", keys.cost))
         self._check_width(cost_key, get_or_raise(tensordict, cost_key))
         data = self._with_ends(self._with_features(tensordict))

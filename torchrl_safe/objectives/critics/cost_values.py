@@ -42,6 +42,7 @@ class CostValues(LossModule):
         super().__init__(*args, **kwargs)
         self.register_state_dict_pre_hook(_build_value_estimators)
         self.register_load_state_dict_pre_hook(_build_value_estimators)
+        self.register_load_state_dict_post_hook(_check_loaded_estimator)
 
     @abc.abstractmethod
     def _default_cost_estimator(self, **hyperparams: Any) -> ValueEstimatorBase:
@@ -170,3 +171,8 @@ def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tenso
 def _build_value_estimators(loss: CostValues, *_: Any) -> None:
     # Their buffers are part of the state: a fresh and a used loss then have the same entries.
     _ = loss.value_estimator, loss.cost_value_estimator
+
+
+def _check_loaded_estimator(loss: CostValues, *_: Any) -> None:
+    # Its discount is part of the state, and one of 1 makes NaN where there is no episode_length.
+    loss._check_cost_value_estimator(loss.cost_value_estimator)

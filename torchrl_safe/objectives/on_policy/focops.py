@@ -150,7 +150,5 @@ class FOCOPSLoss(ConstrainedPPO, PPOLoss):
     def _distribution_keys(self) -> list[NestedKey]:
         return self.actor_network[-1].in_keys
 
-    def _list_in_keys(self) -> None:
-        super()._list_in_keys()
-        keys = [*self.in_keys, *self._distribution_keys()]
-        self.in_keys = list(dict.fromkeys(keys))
+    def _own_in_keys(self) -> list[NestedKey]:
+        return [*super()._own_in_keys(), *self._distribution_keys()]

@@ -65,9 +65,12 @@ class CostUpdater(abc.ABC):
                 f"cost_limit must be one number or one for each of the {len(buffer)} costs, "
                 f"got shape {tuple(limit.shape)}."
             )
-        if not limit.isfinite().all():
-            raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
+        self._check_limit(limit, cost_limit)
         self._cost_limit = limit.expand_as(buffer).clone()
+
+    def _check_limit(self, limit: Tensor, given: object) -> None:
+        if not limit.isfinite().all():
+            raise ValueError(f"cost_limit must be finite, got {given}.")
 
     @torch.no_grad()
     def step(self, episode_cost: Tensor) -> None:

@@ -81,19 +81,22 @@ class MultiplierUpdater(CostUpdater):
         normalize: bool = False,
         cost_names: Sequence[str] | None = None,
     ) -> None:
+        if not isinstance(normalize, bool):
+            raise TypeError(f"normalize must be a bool, got {normalize!r}.")
+        self.normalize = normalize
         super().__init__(
             loss_module, cost_limit=cost_limit, pessimism=pessimism, cost_names=cost_names
         )
         if max_multiplier is not None and as_number(max_multiplier) != math.inf:
             max_multiplier = check_number("max_multiplier", max_multiplier, positive=True)
-        if not isinstance(normalize, bool):
-            raise TypeError(f"normalize must be a bool, got {normalize!r}.")
-        if normalize and (self.cost_limit < 0).any():
-            raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
         self.max_multiplier = max_multiplier
-        self.normalize = normalize
         # The largest so far, slowly forgotten.
         self.cost_scale = torch.zeros_like(self.cost_limit)
+
+    def _check_limit(self, limit: Tensor, given: object) -> None:
+        super()._check_limit(limit, given)
+        if self.normalize and (limit < 0).any():
+            raise ValueError(f"cost_limit must not be negative with normalize, got {given}.")
 
     def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
         violation, cost_scale = self._violation(episode_cost), self.cost_scale
@@ -153,9 +156,10 @@ class MultiplierUpdater(CostUpdater):
         Raises:
             ValueError: if the state is of another kind of updater or another number of costs.
         """
+        # First: it decides which limits can be loaded.
+        self.normalize = state_dict.get("normalize", self.normalize)
         super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
-        self.normalize = state_dict["normalize"]
         self.cost_scale = state_dict["cost_scale"].clone()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -376,6 +377,18 @@ def _check_multipliers(loss: PPOLoss, method: TrustRegionMethod) -> None:
         )
 
 
+def _critic_parameters(loss: PPOLoss) -> Iterator[Tensor]:
+    """Those of its critics, also shared ones, which ``separate_losses`` makes buffers."""
+    critics = [loss.critic_network_params if loss.functional else loss.critic_network]
+    if isinstance(loss, TrustRegionLoss):
+        functional = loss.functional
+        critics.append(loss.cost_critic_network_params if functional else loss.cost_critic_network)
+    for critic in critics:
+        if critic is not None:
+            yield from critic.parameters()
+            yield from critic.buffers()
+
+
 def _check_loss(loss: PPOLoss, method: TrustRegionMethod) -> None:
     # No other subclass: the step has the surrogate of these two, whatever another's forward does.
     if type(loss) is not PPOLoss and not isinstance(loss, TrustRegionLoss):
@@ -385,8 +398,14 @@ def _check_loss(loss: PPOLoss, method: TrustRegionMethod) -> None:
         )
     if loss.reduction != "mean":
         raise ValueError(f"loss_module must have reduction='mean', got {loss.reduction!r}.")
-    if not actor_parameters(loss):
+    moved = {parameter.data_ptr() for parameter in actor_parameters(loss)}
+    if not moved:
         raise ValueError("The actor of loss_module has no trainable parameter.")
+    if any(parameter.data_ptr() in moved for parameter in _critic_parameters(loss)):
+        raise ValueError(
+            "The actor of loss_module must not share parameters with a critic: a step would move "
+            "these too."
+        )
     if not method.constrained:
         return
     if not isinstance(loss, TrustRegionLoss):
