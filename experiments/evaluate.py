@@ -97,6 +97,11 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
             raise ValueError(
                 f"env must be given for a policy that was trained in {saved.settings['env']}."
             )
+        if "name" not in saved.settings:  # Of a loop of one's own.
+            raise ValueError(
+                "env must be given for a policy whose file does not say what it was trained in: "
+                "only those of make train and make ray do."
+            )
         trained = training_config(saved)
         if config.physics is not None:
             trained = replace(trained, physics=config.physics)

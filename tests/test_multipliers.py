@@ -265,7 +265,7 @@ def test_a_cost_that_overflows_leaves_the_optimizer_as_it_was(adam):
 )
 def test_a_cost_of_the_wrong_shape_is_refused(adam, shape):
     before = snapshot(adam)
-    named = rf"episode_cost must have a row .* shape \(E, 2\), got {re.escape(str(shape))}"
+    named = rf"episode_cost must have shape \(E, 2\), .* got {re.escape(str(shape))}"
     with pytest.raises(ValueError, match=named):
         adam.step(torch.zeros(shape))
     assert_unchanged(adam, before)
@@ -354,10 +354,10 @@ def test_limits_go_by_name(rule):
     ("limits", "names", "message"),
     [
         (NAMED, None, r"cost_names must give the costs in their order, .* got None and {'coll"),
-        (NAMED, ["collision"], "cost_names must be a different name for each of the 2 costs, got"),
-        (1.0, ["one", "one"], "cost_names must be a different name for each of the 2 costs, got"),
-        (1.0, "ab", "cost_names must be a different name for each of the 2 costs, got 'ab'"),
-        (1.0, [0, 1], r"cost_names must be a different name for each of the 2 costs, got \[0"),
+        (NAMED, ["collision"], "cost_names must be a different name for each of the 2 costs"),
+        (1.0, ["one", "one"], "cost_names must be a different name for each of the 2 costs"),
+        (1.0, "ab", "cost_names must be a different name for each of the 2 costs .* got 'ab'"),
+        (1.0, [0, 1], r"cost_names must be a different name for each of the 2 costs .* got \[0"),
         (
             {"collision": 0.5},
             ["collision", "speed"],
@@ -401,7 +401,7 @@ def test_errors_name_the_cost():
     largest = torch.finfo(torch.float32).max
     with pytest.raises(ValueError, match=r"a mean and deviation (?s:.*) for cost collision\."):
         updater.step(torch.tensor([[largest, 1.0], [largest, 1.0]]))
-    with pytest.raises(ValueError, match=r"a column for each of the costs collision, speed, "):
+    with pytest.raises(ValueError, match=r"a column for each cost \(collision, speed\)"):
         updater.step(torch.zeros(1, 3))
     unnamed = DualAscent(make_module(0.0, 0.0), cost_limit=1.0, lr=0.1)
     with pytest.raises(ValueError, match=r"finite, got (?s:.*) for cost 1\."):

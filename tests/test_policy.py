@@ -525,6 +525,10 @@ def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):
     save_policy(tmp_path / "policy.pt", actor, Unbounded(3))
     settings = {"env": "mine:pendulum", "episodes": 2, "cost_limits": (0.0, 2.0, 3.0)}
     evaluate.main(evaluate.Config(tmp_path / "policy.pt", max_steps=5, **settings))
+    with pytest.raises(
+        ValueError, match=r"env must be given .* does not say what it was trained in"
+    ):
+        evaluate.main(evaluate.Config(tmp_path / "policy.pt", **{**settings, "env": None}))
     shown = capsys.readouterr().out
     assert "episode cost: 2" in shown
     assert "success" not in shown

@@ -293,6 +293,11 @@ def test_a_step_without_a_cost_raises(make_env):
     dotted = make_env(SafeGymWrapper, Counting(), cost_keys=["costs.heat"])
     with pytest.raises(KeyError, match=r"got only \['cost'.*a tuple: \('costs', 'heat'\)"):
         dotted.rollout(2)
+    group = make_env(SafeGymWrapper, Counting(), cost_keys=["costs"])
+    with pytest.raises(
+        ValueError, match=r"cost 'costs' must be a number, got a group: .*'costs', "
+    ):
+        group.rollout(1)
     no_mapping = make_env(SafeGymWrapper, Counting(), cost_keys=[("cost", "heat")])
     with pytest.raises(KeyError, match=r"info must have \('cost', 'heat'\) in every step"):
         no_mapping.rollout(1)

@@ -113,8 +113,8 @@ def test_what_cannot_be_a_limit_or_a_loss_is_refused():
 @pytest.mark.parametrize(
     ("cost", "message"),
     [
-        (torch.ones(3, 1), r"episode_cost must have a row .* shape \(E, 2\), got \(3, 1\)"),
-        (torch.ones(2), r"episode_cost must have a row .* shape \(E, 2\), got \(2,\)"),
+        (torch.ones(3, 1), r"episode_cost must have shape \(E, 2\), .* got \(3, 1\)"),
+        (torch.ones(2), r"episode_cost must have shape \(E, 2\), .* got \(2,\)"),
         (torch.tensor([[1.0, float("nan")]]), "episode_cost must be finite"),
         (torch.tensor([[2e38, 1.0], [2e38, 1.0]]), "episode_cost must have a mean"),
         (torch.tensor([[1e300, 1.0]], dtype=torch.float64), "episode_cost must have a mean"),

@@ -161,7 +161,11 @@ class _CostBesideReward(GymWrapper):
         # What a single environment nearly always returns is told from the rest without an array.
         if type(value) is float and not self._vectorized and abs(value) <= 1:
             return value
-        return check_array(f"cost {'.'.join(path)!r}", value, self._cost.shape[:-1])
+        name = f"cost {'.'.join(path)!r}"
+        if isinstance(value, Mapping):
+            entries = [(*path, key) for key in value]
+            raise ValueError(f"{name} must be a number, got a group: name its entries, {entries}.")
+        return check_array(name, value, self._cost.shape[:-1])
 
 
 def _encode(spec: TensorSpec, value: Any) -> Tensor:

@@ -49,7 +49,10 @@ class CostToReward(Transform):
         if isinstance(in_keys, str) or not in_keys:
             raise ValueError(f"in_keys must be a sequence of at least one key, got {in_keys!r}.")
         if isinstance(out_keys, str) or len(out_keys) != 1:
-            raise ValueError(f"out_keys must be a sequence of one key, got {out_keys!r}.")
+            raise ValueError(
+                f"out_keys must be a sequence of one key, such as [('costs', 'all')], got "
+                f"{out_keys!r}."
+            )
         super().__init__(
             in_keys=[unravel_key(key) for key in in_keys],
             out_keys=[unravel_key(key) for key in out_keys],

@@ -94,8 +94,8 @@ class CostUpdater(abc.ABC):
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:
             shape = tuple(episode_cost.shape)
             raise ValueError(
-                "episode_cost must have a row for each episode that ended and a column for each of "
-                f"the costs {', '.join(self.cost_names)}, shape (E, {len(buffer)}), got {shape}."
+                f"episode_cost must have shape (E, {len(buffer)}), a row for each episode that "
+                f"ended and a column for each cost ({', '.join(self.cost_names)}), got {shape}."
             )
         if not (usable := episode_cost.isfinite().all(0)).all():
             raise ValueError(
@@ -164,8 +164,8 @@ def check_names(cost_names: Sequence[str] | None, num_costs: int) -> tuple[str, 
         or len(names) != num_costs
     ):
         raise ValueError(
-            f"cost_names must be a different name for each of the {num_costs} costs, got "
-            f"{cost_names!r}."
+            f"cost_names must be a different name for each of the {num_costs} costs of the loss "
+            f"(num_costs), got {cost_names!r}."
         )
     return tuple(names)
 
