@@ -47,6 +47,8 @@ from torchrl_safe.objectives import (
 )
 from torchrl_safe.policy import save_policy
 
+# The first seed that training does not use. Environments may take seeds of 32 bits only.
+EVALUATION = 2**31
 # Settings that may differ when a run is resumed: they do not change what is learnt.
 CHANGEABLE = ("out", "logger", "resume", "eval_episodes")
 
@@ -116,8 +118,8 @@ class Config:
         for name in (*counts, "epochs", "minibatch", "random_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}.")
+        if not 0 <= self.seed < EVALUATION:
+            raise ValueError(f"seed must be at least 0 and below {EVALUATION}, got {self.seed}.")
         for name in ("max_kl", "learning_rate", "max_grad_norm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
@@ -395,7 +397,7 @@ def begin_episodes(config: Config, collector: Collector, frames: int) -> None:
     Gymnasium's environments cannot be saved. So that a resumed run is the same as one that was
     never stopped, both do this at every checkpoint.
     """
-    seed = config.seed * 100_000_000 + frames
+    seed = (config.seed * 100_000_000 + frames) % EVALUATION
     torch.manual_seed(seed)
     collector.set_seed(seed)
     collector.reset()
@@ -479,8 +481,8 @@ def main(config: Config) -> dict[str, Any]:
     save_policy(
         config.out / "policy.pt", agent.actor, env.observation_spec_unbatched, settings=kept
     )
-    # Seeds that training does not use. The statistics of observations stay as they are.
-    episodes = evaluate(env, agent.actor, config.eval_episodes, seed=config.seed + 10_000_000_000)
+    # The statistics of observations stay as they are.
+    episodes = evaluate(env, agent.actor, config.eval_episodes, seed=EVALUATION + config.seed)
     env.close()
     results = {
         "config": dataclasses.asdict(config),

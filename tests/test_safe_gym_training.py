@@ -278,7 +278,7 @@ def test_divergence_is_that_of_the_distributions(make_env):
         ({"gamma": 1.0}, "gamma must be between 0 and 1"),
         ({"max_kl": 0.0}, "max_kl must be positive"),
         ({"epochs": 0}, "epochs must be at least 1"),
-        ({"seed": -1}, "seed must not be negative, got -1"),
+        ({"seed": -1}, "seed must be at least 0 and below 2147483648, got -1"),
     ],
 )
 def test_settings_that_make_no_sense(changes, message):

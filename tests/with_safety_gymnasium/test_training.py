@@ -77,3 +77,10 @@ def test_train_stop_go_on_and_evaluate(tmp_path, monkeypatch):
     loc = whole.explorer.module.policy(torch.from_numpy(observations))[0]
     expected = loc.detach().tanh().numpy()
     np.testing.assert_allclose(np.load(files[1]), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_an_environment_whose_seeds_have_32_bits(tmp_path):
+    """Swimmer takes any. With seed 60 it is more than 32 bits for which training once asked."""
+    settings = {"frames": 2_000, "frames_per_batch": 2_000, "seed": 60, "out": tmp_path}
+    results = safe_gym.main(replace(SMALL, env="SafetyPointGoal1-v0", **settings))
+    assert results["evaluation"]["steps"] == [1_000, 1_000, 1_000]
