@@ -241,7 +241,7 @@ def test_no_updater():
         (
             {"episode_cost_key": "observation"},
             ValueError,
-            r"episode_cost must have a row .* shape \(E, 2\), got \(5, 4\)",
+            r"episode_cost must have shape \(E, 2\), .* got \(5, 4\)",
         ),
     ],
 )
@@ -284,7 +284,7 @@ def test_the_hook_in_a_sac_trainer(tmp_path):
     """Off policy it is the same hook: costs of 5 in each episode again, one cost this time."""
     torch.manual_seed(0)
     arm = ArmEnv(num_envs=WORLDS, costs={"always": always}, max_episode_steps=STEPS, seed=0)
-    env = TransformedEnv(arm, RewardSum(["reward", "cost"], ["reward_sum", "episode_cost"]))
+    env = TransformedEnv(arm, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
     observations = env.observation_spec["observation"].shape[-1]
     actor = make_actor(observations)
     inputs = {"in_keys": ["observation", "action"]}
@@ -310,6 +310,7 @@ def test_the_hook_in_a_sac_trainer(tmp_path):
         logger=logger,
         log_interval=0,
         progress_bar=False,
+        episode_reward_key="episode_reward",
     )
     updater = DualAscent(loss, cost_limit=2.0, lr=0.1)
     MultiplierHook(updater, cost_names=["always"]).register(trainer)
