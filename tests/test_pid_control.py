@@ -2,7 +2,6 @@
 
 import copy
 import math
-import re
 
 import pytest
 import torch
@@ -216,7 +215,7 @@ def test_a_multiplier_that_would_overflow_is_refused(updater):
 
 def test_a_cost_of_the_wrong_shape_is_refused(updater):
     before = snapshot(updater)
-    with pytest.raises(ValueError, match=re.escape("(E, 2), got (5, 3)")):
+    with pytest.raises(ValueError, match=r"shape \(E, 2\), .* got \(5, 3\)"):
         updater.step(torch.zeros(5, 3))
     assert_unchanged(updater, before)
 
