@@ -374,6 +374,13 @@ def test_each_agent_has_a_tally(kind, ends_by_agent):
     assert_close(used, steps[:, :, None] * torch.arange(1.0, 4.0), atol=1e-4, rtol=0)
 
 
+def test_the_tallies_of_agents_may_stand_in_a_group_of_their_own():
+    saute = Saute(100.0, unsafe_reward=-1.0, **AGENTS, out_key=("budget", "left"))
+    env = TransformedEnv(Crew(ends_by_agent=False), saute)
+    check_env_specs(env)
+    assert env.rollout(2)["next", "budget", "left"].shape == (2, 2, 3, 2)
+
+
 def test_budgets_are_part_of_the_state():
     saved = inside(partial(EarlyTermination, 0.7))
     loaded = inside(partial(EarlyTermination, 5.0))

@@ -203,6 +203,11 @@ def test_a_full_disk_leaves_the_one_before(run, net):
     assert weight_after_load(run, net) == [1]
 
 
+def test_a_name_that_is_no_file_is_refused_at_once(tmp_path, net):
+    with pytest.raises(ValueError, match="path separators"):
+        RunCheckpoints(tmp_path, {"a/b": net})
+
+
 def test_an_error_of_a_component_is_its_own(run, net):
     """Not one of the disk."""
 

@@ -419,6 +419,10 @@ def test_normalized_limits_are_not_negative():
     plain = DualAscent(make_module(0.0), cost_limit=-1.0, lr=0.1)
     updater.load_state_dict(plain.state_dict())  # With its option.
     assert not updater.normalize
+    normalized = DualAscent(make_module(0.0), cost_limit=1.0, lr=0.1, normalize=True)
+    with pytest.raises(ValueError, match="2 cost limits"):
+        normalized.load_state_dict(DualAscent(make_module(0, 0), cost_limit=1, lr=1).state_dict())
+    assert normalized.normalize
 
 
 def test_a_loss_without_the_buffer_is_refused():

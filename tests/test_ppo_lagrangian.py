@@ -375,8 +375,9 @@ def test_advantages_are_those_of_the_steps_that_count(key):
     assert "shifted_valid" not in padded
 
 
+@pytest.mark.parametrize("terminated", [True, False])
 @pytest.mark.parametrize("time_dim", [None, 0])
-def test_what_pads_a_trajectory_changes_no_target(time_dim):
+def test_what_pads_a_trajectory_changes_no_target(time_dim, terminated):
     """Not even where the end of the batch cut it, so that it is not done."""
     batch = make_batch(2)
     done = batch["next", "done"].squeeze(-1)
@@ -390,6 +391,8 @@ def test_what_pads_a_trajectory_changes_no_target(time_dim):
         loss.make_value_estimator(time_dim=time_dim)
         return loss.make_cost_value_estimator(time_dim=time_dim)
 
+    if not terminated:  # Then estimators take done for it.
+        del batch["next", "terminated"]
     split = split_trajectories(batch.clone(), trajectory_key=("collector", "traj_ids"))
     assert split["next", "done"].any(1).logical_not().any()  # Some are cut.
     ends = split["next", "done"].clone()
@@ -399,6 +402,7 @@ def test_what_pads_a_trajectory_changes_no_target(time_dim):
     else:
         whole, split = (loss().estimate_advantages(data) for data in (batch, split))
     assert torch.equal(split["next", "done"], ends)
+    assert (("next", "terminated") in split.keys(True)) is terminated
     counts = split["collector", "mask"]
 
     def in_order(data, key):

@@ -73,7 +73,7 @@ def test_names_are_those_of_the_scripts():
         ({"name": "My task"}, ValueError, "name must be lower-case words joined by hyphens"),
         ({"name": ""}, ValueError, "name must be lower-case words joined by hyphens, got ''"),
         ({"arm": "panda"}, TypeError, "arm must be an instance of ArmModel"),
-        ({"task": Reach}, TypeError, r"task must be an instance of Task, got .*Reach'>: add \(\)"),
+        ({"task": Reach}, TypeError, r"task must be an instance of Task, got .*Reach'>, a class"),
         ({"obstacles": None}, TypeError, "obstacles must be an instance of Obstacles"),
         ({"action": 3}, TypeError, "action must be an instance of ActionMode"),
         ({"costs": {}}, ValueError, "cost_limits must have a limit for each of costs"),

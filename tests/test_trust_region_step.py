@@ -776,6 +776,19 @@ def test_other_bad_losses_are_refused():
         TrustRegionStep(loss)
 
 
+def test_the_actor_may_be_lazy_until_the_first_step():
+    _, critic, cost_critic = make_networks()
+    net = nn.Sequential(nn.LazyLinear(2 * ACTION_SIZE), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(net, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+    loss = TrustRegionLoss(actor, critic, cost_critic, functional=False, entropy_bonus=False)
+    assert TrustRegionStep(loss).loss_module is loss
+
+
 @pytest.mark.parametrize("functional", [True, False])
 @pytest.mark.parametrize("separate", [True, False])
 @pytest.mark.parametrize("kind", ["reward", "cost"])

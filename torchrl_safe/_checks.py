@@ -51,7 +51,7 @@ def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
     if isinstance(value, type) or not isinstance(value, kind):
         kinds = get_args(kind) or (kind,)
         names = " or ".join(each.__name__ for each in kinds)
-        lacks = ": add () to make one of the class" if isinstance(value, type) else ""
+        lacks = ", a class and not an object" if isinstance(value, type) else ""
         if Protocol in kinds[0].__mro__ and not isinstance(value, type):
             members = [member for member in dir(kinds[0]) if not member.startswith("_")]
             missing = [member for member in members if not hasattr(value, member)]

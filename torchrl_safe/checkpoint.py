@@ -74,6 +74,7 @@ class RunCheckpoints:
             self.folder, keep_last=keep_last, keep_best=("score", "max")
         )
         self._components = dict(components)
+        self._checkpoint = _checkpoint_of(components)
 
     def save(self, step: int, *, score: float | None = None) -> Path:
         """Saves all components.
@@ -164,7 +165,7 @@ class RunCheckpoints:
                 raise CheckpointError(
                     f"component {name!r} is not what this class writes, but {component['files']}"
                 )
-        _checkpoint_of(self._components).load(path, map_location=map_location)
+        self._checkpoint.load(path, map_location=map_location)
         return int(path.stem.removeprefix("checkpoint-"))
 
 

@@ -111,8 +111,8 @@ class CostTally(Transform, abc.ABC):
     def _add_tally(self, specs: Composite, rewards: Composite) -> None:
         spec, folder = self._tally_spec(rewards), _folder(self.out_key)
         for depth in range(1, len(folder) + 1):  # A new group would not get the batch of agents.
-            if folder[:depth] not in specs.keys(True):
-                specs[folder[:depth]] = Composite(shape=spec.shape[:-1], device=spec.device)
+            if (key := folder[:depth]) not in specs.keys(True) and key in rewards.keys(True):
+                specs[key] = Composite(shape=rewards[key].shape, device=spec.device)
         specs[self.out_key] = spec
 
     def _reset(

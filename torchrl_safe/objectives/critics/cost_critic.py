@@ -23,7 +23,7 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
 from torchrl_safe.objectives._checks import check_number
-from torchrl_safe.objectives._reduction import counted, reduced
+from torchrl_safe.objectives._reduction import counted, expanded_mask, reduced
 from torchrl_safe.objectives.critics.cost_gae import CostGAE
 from torchrl_safe.objectives.critics.cost_values import CostValues, get_or_raise
 from torchrl_safe.objectives.functional import scaled_advantages
@@ -115,7 +115,7 @@ class CostCritic(CostValues):
         it yourself, once for each batch). The cost advantages are centred and, with
         ``normalize_cost_advantage``, divided by a scale that the loss keeps from call to call.
         Steps that the loss leaves out, such as those that pad a trajectory
-        (``("collector", "mask")``), do not count: neither here nor in the advantages of others.
+        (``("collector", "mask")``), do not count. A trajectory ends where its padding begins.
 
         If you call the loss with a batch that has no advantages, it does the same first.
 
@@ -163,9 +163,8 @@ class CostCritic(CostValues):
         data.set(keys.advantage, advantage)
         data.set(keys.cost_advantage, cost_advantage)
         if data is not tensordict:
-            changed = [*self._shared_keys, keys.done]
-            hidden = [*self._shared_keys, *(unravel_key(("next", key)) for key in changed)]
-            tensordict.update(data.exclude(*hidden))
+            hidden = [*self._shared_keys, *(unravel_key(("next", k)) for k in self._shared_keys)]
+            tensordict.update(data.exclude(*hidden, *self._end_keys()))
 
     def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
         """What the cost advantages of this batch are divided by; None if by nothing."""
@@ -193,20 +192,27 @@ class CostCritic(CostValues):
         return data
 
     def _with_ends(self, data: TensorDictBase) -> TensorDictBase:
-        """The batch, with trajectories that end where the next step does not count.
+        """The batch, with trajectories that end where what pads them begins.
 
-        To an estimator what pads a trajectory would be what followed.
+        To an estimator the padding would be what followed.
         """
-        key = unravel_key(("next", self.tensor_keys.done))
-        done = get_or_raise(data, key)
-        mask = counted(self, data, done)
-        if mask is None:
+        mask = data.get(("collector", "mask"), None)
+        if mask is None or self.loss_mask_key is None:
             return data
+        keys = self._end_keys()
+        done = get_or_raise(data, keys[0])
         time = getattr(self.value_estimator, "time_dim", None)  # Not all of TorchRL's have it.
         if time is None:
             time = data.names.index("time") if "time" in data.names else data.ndim - 1
-        follows = mask.roll(-1, time % data.ndim)
-        return data.clone(False).set(key, done | (mask & ~follows))
+        mask = mask.reshape(data.shape).bool()
+        last = mask & ~mask.roll(-1, time % data.ndim)
+        terminated = data.get(keys[1], done)  # What estimators take for it.
+        data = data.clone(False).set(keys[0], done | expanded_mask(last, done))
+        return data.set(keys[1], terminated)
+
+    def _end_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        return [unravel_key(("next", key)) for key in (keys.done, keys.terminated)]
 
     def _check_width(self, key: NestedKey, values: Tensor) -> None:
         if values.shape[-1] != self.num_costs:

@@ -156,9 +156,13 @@ class MultiplierUpdater(CostUpdater):
         Raises:
             ValueError: if the state is of another kind of updater or another number of costs.
         """
-        # First: it decides which limits can be loaded.
-        self.normalize = state_dict.get("normalize", self.normalize)
-        super().load_state_dict(state_dict)
+        # The limits in a state were checked with the ``normalize`` in it.
+        normalize, self.normalize = self.normalize, False
+        try:
+            super().load_state_dict(state_dict)
+        finally:
+            self.normalize = normalize
+        self.normalize = state_dict["normalize"]
         self.max_multiplier = state_dict["max_multiplier"]
         self.cost_scale = state_dict["cost_scale"].clone()
 

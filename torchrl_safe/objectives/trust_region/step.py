@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.distributions import Distribution
+from torch.nn.parameter import is_lazy
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import PPOLoss
 
@@ -377,6 +378,10 @@ def _check_multipliers(loss: PPOLoss, method: TrustRegionMethod) -> None:
         )
 
 
+def _places(parameters: Iterable[Tensor]) -> set[int]:
+    return {each.data_ptr() for each in parameters if not is_lazy(each)}
+
+
 def _critic_parameters(loss: PPOLoss) -> Iterator[Tensor]:
     """Those of its critics, also shared ones, which ``separate_losses`` makes buffers."""
     critics = [loss.critic_network_params if loss.functional else loss.critic_network]
@@ -398,10 +403,9 @@ def _check_loss(loss: PPOLoss, method: TrustRegionMethod) -> None:
         )
     if loss.reduction != "mean":
         raise ValueError(f"loss_module must have reduction='mean', got {loss.reduction!r}.")
-    moved = {parameter.data_ptr() for parameter in actor_parameters(loss)}
-    if not moved:
+    if not (moved := actor_parameters(loss)):
         raise ValueError("The actor of loss_module has no trainable parameter.")
-    if any(parameter.data_ptr() in moved for parameter in _critic_parameters(loss)):
+    if _places(moved) & _places(_critic_parameters(loss)):
         raise ValueError(
             "The actor of loss_module must not share parameters with a critic: a step would move "
             "these too."
