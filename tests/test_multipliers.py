@@ -354,8 +354,16 @@ def test_limits_go_by_name(rule):
     ("limits", "names", "message"),
     [
         (NAMED, None, r"cost_names must give the costs in their order, .* got None and {'coll"),
-        (NAMED, ["collision"], "cost_names must be a different name for each of the 2 costs"),
-        (1.0, ["one", "one"], "cost_names must be a different name for each of the 2 costs"),
+        (
+            NAMED,
+            ["collision"],
+            r"a different name for each of the 2 costs of the loss \(num_costs\), got",
+        ),
+        (
+            1.0,
+            ["one", "one"],
+            r"a different name for each of the 2 costs of the loss \(num_costs\), got",
+        ),
         (1.0, "ab", "cost_names must be a different name for each of the 2 costs .* got 'ab'"),
         (1.0, [0, 1], r"cost_names must be a different name for each of the 2 costs .* got \[0"),
         (
@@ -401,7 +409,7 @@ def test_errors_name_the_cost():
     largest = torch.finfo(torch.float32).max
     with pytest.raises(ValueError, match=r"a mean and deviation (?s:.*) for cost collision\."):
         updater.step(torch.tensor([[largest, 1.0], [largest, 1.0]]))
-    with pytest.raises(ValueError, match=r"a column for each cost \(collision, speed\)"):
+    with pytest.raises(ValueError, match=r"a column for each cost \(collision, speed\), got"):
         updater.step(torch.zeros(1, 3))
     unnamed = DualAscent(make_module(0.0, 0.0), cost_limit=1.0, lr=0.1)
     with pytest.raises(ValueError, match=r"finite, got (?s:.*) for cost 1\."):

@@ -73,7 +73,6 @@ class RunCheckpoints:
         self._rotation = CheckpointRotation(
             self.folder, keep_last=keep_last, keep_best=("score", "max")
         )
-        self._components = dict(components)
         self._checkpoint = _checkpoint_of(components)
 
     def save(self, step: int, *, score: float | None = None) -> Path:
@@ -91,7 +90,8 @@ class RunCheckpoints:
             OSError: if it could not be written, for example because the disk is full; those
                 before are intact. What a ``state_dict`` raises is raised as it is.
         """
-        taken = {name: _Taken(part.state_dict()) for name, part in self._components.items()}
+        parts = self._checkpoint.components
+        taken = {name: _Taken(part.state_dict()) for name, part in parts.items()}
         scores = {} if score is None else {"score": score}
         metadata = {"settings": self.settings, **scores}
         path = self.folder / f"checkpoint-{step:012d}.torchrl"

@@ -55,6 +55,10 @@ class CostUpdater(abc.ABC):
 
     @cost_limit.setter
     def cost_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> None:
+        self._cost_limit = self._as_limit(cost_limit)
+
+    def _as_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> Tensor:
+        """The limits, shape ``(k,)``, or an error that says why they cannot be used."""
         buffer = getattr(self.loss_module, self.buffer_name)
         numbers: Any = cost_limit
         if isinstance(cost_limit, Mapping):
@@ -65,12 +69,9 @@ class CostUpdater(abc.ABC):
                 f"cost_limit must be one number or one for each of the {len(buffer)} costs, "
                 f"got shape {tuple(limit.shape)}."
             )
-        self._check_limit(limit, cost_limit)
-        self._cost_limit = limit.expand_as(buffer).clone()
-
-    def _check_limit(self, limit: Tensor, given: object) -> None:
         if not limit.isfinite().all():
-            raise ValueError(f"cost_limit must be finite, got {given}.")
+            raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
+        return limit.expand_as(buffer).clone()
 
     @torch.no_grad()
     def step(self, episode_cost: Tensor) -> None:
@@ -149,7 +150,8 @@ class CostUpdater(abc.ABC):
                 f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "
                 f"{len(self.cost_limit)}."
             )
-        self.cost_limit = state_dict["cost_limit"]
+        # Not by a subclass: its options are still those from before the state.
+        self._cost_limit = CostUpdater._as_limit(self, state_dict["cost_limit"])
         self.pessimism = state_dict["pessimism"]
 
 

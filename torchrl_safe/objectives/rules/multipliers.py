@@ -93,10 +93,11 @@ class MultiplierUpdater(CostUpdater):
         # The largest so far, slowly forgotten.
         self.cost_scale = torch.zeros_like(self.cost_limit)
 
-    def _check_limit(self, limit: Tensor, given: object) -> None:
-        super()._check_limit(limit, given)
+    def _as_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> Tensor:
+        limit = super()._as_limit(cost_limit)
         if self.normalize and (limit < 0).any():
-            raise ValueError(f"cost_limit must not be negative with normalize, got {given}.")
+            raise ValueError(f"cost_limit must not be negative with normalize, got {cost_limit}.")
+        return limit
 
     def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
         violation, cost_scale = self._violation(episode_cost), self.cost_scale
@@ -156,14 +157,9 @@ class MultiplierUpdater(CostUpdater):
         Raises:
             ValueError: if the state is of another kind of updater or another number of costs.
         """
-        # The limits in a state were checked with the ``normalize`` in it.
-        normalize, self.normalize = self.normalize, False
-        try:
-            super().load_state_dict(state_dict)
-        finally:
-            self.normalize = normalize
-        self.normalize = state_dict["normalize"]
+        super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
+        self.normalize = state_dict["normalize"]
         self.cost_scale = state_dict["cost_scale"].clone()
 
 
