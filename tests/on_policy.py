@@ -1,4 +1,4 @@
-"""A PPO-Lagrangian loss on the networks of ``torchrl_safe.testing``, and composite actions."""
+"""PPO-Lagrangian losses on the networks of ``torchrl_safe.testing``, and what tests ask of them."""
 
 from functools import partial
 
@@ -10,6 +10,15 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl_safe.objectives import PPOLagrangianLoss
 from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
 from torchrl_safe.testing.networks import mlp
+
+NETWORKS = ("actor", "critic", "cost_critic")
+# Only these outputs have a gradient, and this is the network each of them trains.
+TRAINS = {
+    "loss_objective": "actor",
+    "loss_entropy": "actor",
+    "loss_critic": "critic",
+    "loss_cost_critic": "cost_critic",
+}
 
 
 def make_loss(num_costs=1, seed=0, **kwargs):
@@ -50,3 +59,33 @@ def make_composite(num_costs):
         for key in ("move_log_prob", "grip_log_prob"):  # As of an older policy.
             batch[key] = batch[key] + 0.2 * torch.randn_like(batch[key])
     return actor, make_critic(), make_critic("cost_value", num_costs), batch
+
+
+def parameters(loss, network):
+    if loss.functional:
+        return list(getattr(loss, f"{network}_network_params").values(True, True))
+    return list(getattr(loss, f"{network}_network").parameters())
+
+
+def networks_with_gradient(loss):
+    def is_reached(p):
+        return p.grad is not None and bool(p.grad.any())
+
+    return {name for name in NETWORKS if any(map(is_reached, parameters(loss, name)))}
+
+
+def assert_same_outputs(actual, expected):
+    """Every output of ``expected`` is in ``actual``, bit for bit."""
+    for key, value in expected.items():
+        assert torch.equal(actual[key], value), key
+
+
+def assert_close_outputs(actual, expected):
+    assert set(actual.keys()) == set(expected.keys())
+    for key, value in expected.items():
+        torch.testing.assert_close(actual[key], value, msg=lambda text, key=key: f"{key}: {text}")
+
+
+def estimated(loss, num_costs=1, seed=1):
+    """A flat batch with both advantages."""
+    return loss.estimate_advantages(make_batch(num_costs, seed=seed)).reshape(-1)

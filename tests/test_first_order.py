@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from on_policy import make_loss
+from on_policy import estimated, make_loss
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from tensordict.utils import unravel_key
@@ -50,10 +50,6 @@ every_loss = pytest.mark.parametrize("make", LOSSES.values(), ids=LOSSES.keys())
 
 def build(make, num_costs=1, seed=0, **kwargs):
     return make(*make_networks(num_costs, seed=seed), num_costs=num_costs, **kwargs)
-
-
-def estimated(loss, num_costs=1, seed=1):
-    return loss.estimate_advantages(make_batch(num_costs, seed=seed)).reshape(-1)
 
 
 def step(loss, violation):

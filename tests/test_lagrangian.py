@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from on_policy import make_loss
+from on_policy import assert_same_outputs, make_loss
 from tensordict.nn import (
     NormalParamExtractor,
     ProbabilisticTensorDictModule,
@@ -53,11 +53,6 @@ def wrap(parent, num_costs=1, seed=0, **kwargs):
 def bare(parent, seed=0):
     actor, critic, _ = make_networks(seed=seed)
     return parent(actor, critic)
-
-
-def assert_same_outputs(actual, expected):
-    for key, value in expected.items():
-        assert torch.equal(actual[key], value), key
 
 
 def total(losses):
