@@ -34,7 +34,7 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS
 from experiments.config import Config as TrainConfig
-from experiments.files import is_new
+from experiments.files import require_new
 from experiments.log import Log, figures
 from torchrl_safe.envs import ArmEnv, Collision, Speed
 from torchrl_safe.policy import save_policy
@@ -166,8 +166,7 @@ class Collection:
 
 def main(config: Config) -> dict[str, Any]:
     """Trains; returns the last figures and how often actors were replaced."""
-    if not is_new(config.out):
-        raise FileExistsError(f"out must be a new or empty folder, got {str(config.out)!r}.")
+    require_new(config.out)
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)

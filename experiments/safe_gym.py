@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
 from experiments.compiling import compiled
-from experiments.files import is_new, write_whole
+from experiments.files import TO_RESUME, require_new, write_whole
 from experiments.learners import NOT_LEARNT_FROM, Objective, moved_from_here, summed
 from experiments.log import Log, figures, versions
 from torchrl_safe.checkpoint import RunCheckpoints
@@ -467,12 +467,9 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
 
 def main(config: Config) -> dict[str, Any]:
     """Trains, evaluates, and writes the results."""
-    if not config.resume and not is_new(config.out):
-        raise FileExistsError(
-            f"out must be a new or empty folder, got {str(config.out)!r}. To resume the run in it, "
-            "add --resume with the same options."
-        )
-    if config.resume and not (config.out / "checkpoints").exists():
+    if not config.resume:
+        require_new(config.out, TO_RESUME)
+    elif not (config.out / "checkpoints").exists():
         print(f"There is no run in {config.out} to resume: this begins one.")
     agent, log = train(config)
     seconds = log.seconds

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, Training, configured, own_settings
 from experiments.config import AlgorithmName, Config, command_line
 from experiments.demonstrations import CARE, start_from_demonstrations
-from experiments.files import is_new, write_whole
+from experiments.files import TO_RESUME, require_new, write_whole
 from experiments.film import Policy, save_film
 from experiments.grid import side_by_side
 from experiments.log import Log, figures, progress_text, score, summed_costs, versions
@@ -369,13 +369,11 @@ def start(config: Config) -> dict[str, Any]:
         before = json.loads(path.read_text())
         refuse_other_settings(settings(before["config"]), settings(results["config"]))
         results["algorithms"] = before["algorithms"]
-    elif not is_new(config.out):
-        hint = "To resume the run in it, add --resume with the same options."
-        if config.resume:
-            hint = "There is no run in it to resume."
-        raise FileExistsError(f"out must be a new or empty folder, got {str(config.out)!r}. {hint}")
     elif config.resume:
+        require_new(config.out, "There is no run in it to resume.")
         print(f"There is no run in {config.out} to resume: this begins one.")
+    else:
+        require_new(config.out, TO_RESUME)
     config.out.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(results, indent=1, default=str))
     return results
