@@ -20,7 +20,7 @@ import tyro
 from experiments import train
 from experiments.algorithms import ALGORITHMS, configured
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine
-from experiments.grid import run_grid, save_results
+from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
 from experiments.style import LIGHT, colour, cost_axis, figure_style, label, limit_line
 from torchrl_safe.metrics import worst_seed
@@ -46,16 +46,19 @@ class Config:
     """Engine that simulates the arm; bullet takes several times as long."""
     cost_limit: float = TrainConfig.cost_limit
     """Limit of the expected cost of an episode; budgets of single episodes are at least 2."""
-    seeds: int = 5
-    """Runs of each algorithm, with seeds from 0."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of the runs."""
     frames: int = TrainConfig.frames
     """Control steps to train for."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
-    workers: int = os.cpu_count() or 1
+    jobs: int = os.cpu_count() or 1
     """Runs side by side."""
     out: Path = Path("runs/compare")
     """Folder of results; runs that are already there are not run again."""
+
+    def __post_init__(self) -> None:
+        check_grid(self, "algorithms", "seeds")
 
 
 def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
@@ -78,7 +81,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
             ),
             algorithm,
         )
-        for seed, algorithm in product(range(config.seeds), config.algorithms)
+        for seed, algorithm in product(config.seeds, config.algorithms)
     }
 
 
@@ -157,7 +160,7 @@ def _points(runs: list[dict[str, Any]], algorithm: str) -> np.ndarray:
 def main(config: Config) -> None:
     """Runs what is missing, then writes table, figure and results.json."""
     grid = jobs(config)
-    results = run_grid(train.run, grid, workers=config.workers, name="compare")
+    results = run_grid(train.run, grid, workers=config.jobs, name="compare")
     runs = [
         {
             "algorithm": algorithm,

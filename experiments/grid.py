@@ -19,6 +19,16 @@ from experiments.log import versions
 from torchrl_safe.checkpoint import refuse_other_settings
 
 
+def check_grid(config: Any, *names: str) -> None:
+    """Checks the settings of a grid: ``jobs``, and what it goes through, each thing once."""
+    for name in names:
+        values = getattr(config, name)
+        if not values or len(set(values)) != len(values):
+            raise ValueError(f"{name} must name at least one, each once, got {values}.")
+    if config.jobs < 1:
+        raise ValueError(f"jobs must be at least 1, got {config.jobs}.")
+
+
 def missing(jobs: Mapping[Path, Any]) -> list[Path]:
     """The files of jobs that have not been run."""
     return [path for path in jobs if not path.exists()]

@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 
 from experiments import train
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, MultiplierRule
-from experiments.grid import run_grid, save_results
+from experiments.grid import check_grid, run_grid, save_results
 from experiments.style import GREY, colour, cost_axis, figure_style, limit_line
 
 RULES: tuple[MultiplierRule, ...] = ("dual-ascent", "pid")
@@ -39,16 +39,19 @@ class Config:
     """What an action moves."""
     physics: Engine = "mujoco"
     """Engine that simulates the arm; bullet takes several times as long."""
-    seeds: int = 3
-    """Runs of each, with seeds from 0."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the runs."""
     frames: int = TrainConfig.frames
     """Control steps to train for."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
-    workers: int = os.cpu_count() or 1
+    jobs: int = os.cpu_count() or 1
     """Runs side by side."""
     out: Path = Path("runs/profile")
     """Folder of results; runs that are already there are not run again."""
+
+    def __post_init__(self) -> None:
+        check_grid(self, "seeds")
 
 
 def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
@@ -70,7 +73,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
             ),
             "ppo-lagrangian",
         )
-        for seed, (rule, value) in product(range(config.seeds), settings(config))
+        for seed, (rule, value) in product(config.seeds, settings(config))
     }
 
 
@@ -166,8 +169,8 @@ def _draw_front(axis: Axes, fixed: dict[float, np.ndarray]) -> None:
 
 def main(config: Config) -> None:
     """Runs what is missing, then writes table, figure and results.json."""
-    results = run_grid(train.run, jobs(config), workers=config.workers, name="profile")
-    names = product(range(config.seeds), settings(config))
+    results = run_grid(train.run, jobs(config), workers=config.jobs, name="profile")
+    names = product(config.seeds, settings(config))
     runs = [
         {"rule": rule, "value": value, "seed": seed, **result}
         for (seed, (rule, value)), result in zip(names, results, strict=True)

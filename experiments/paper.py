@@ -24,7 +24,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
-from experiments.grid import run_grid, save_results
+from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import LEARNING, Line, mean_of_known, plot_learning
 from experiments.style import colour
 from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ActionMode, paper_env
@@ -60,18 +60,21 @@ _LATE = 20
 class Config:
     """Run the paper's four experiments again."""
 
-    seeds: int = 5
-    """Runs of each experiment, with seeds from 0."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of the runs."""
     epochs: int = 200
     """Batches of 1000 control steps."""
     cost_limit: float = 25.0
     """Limit of the expected cost of an episode, in control steps with a contact."""
-    workers: int = os.cpu_count() or 1
+    jobs: int = os.cpu_count() or 1
     """Runs side by side."""
     eval_episodes: int = 100
     """Episodes of the final evaluation of each run, with the deterministic policy."""
     out: Path = Path("runs/paper")
     """Folder of results; runs that are already there are not run again."""
+
+    def __post_init__(self) -> None:
+        check_grid(self, "seeds")
 
 
 def make_env(action: str, num_envs: int, seed: int) -> EnvBase:
@@ -200,7 +203,7 @@ def jobs(config: Config) -> dict[Path, tuple[str, int, int, float, int]]:
     settings = (config.epochs, config.cost_limit, config.eval_episodes)
     return {
         config.out / f"{cell.replace(' ', '-')}-{seed}.json": (cell, seed, *settings)
-        for seed, cell in product(range(config.seeds), CELLS)
+        for seed, cell in product(config.seeds, CELLS)
     }
 
 
@@ -258,7 +261,7 @@ def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:
 
 def main(config: Config) -> None:
     """Runs what is missing, then writes table, figure and results.json."""
-    runs = run_grid(run, jobs(config), workers=config.workers, name="paper")
+    runs = run_grid(run, jobs(config), workers=config.jobs, name="paper")
     save_results(config.out, config, runs, table(runs))
     plot(runs, config.out / "curves.png", config.cost_limit)
 

@@ -21,7 +21,7 @@ import tyro
 
 from experiments import safe_gym
 from experiments.files import write_whole
-from experiments.grid import run_grid
+from experiments.grid import check_grid, run_grid
 
 Library = Literal["ours", "omnisafe"]
 
@@ -34,16 +34,19 @@ class Config:
     """Environments of Safety-Gymnasium."""
     libraries: tuple[Library, ...] = ("ours", "omnisafe")
     """Whose PPO-Lagrangian to train with."""
-    seeds: int = 3
-    """Runs for each environment and library, with seeds from 0."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the runs."""
     frames: int = 500_000
     """Steps to train for; whole epochs of OmniSafe, 20,000 steps each."""
     cost_limit: float = 25.0
     """Limit of the expected cost of an episode."""
-    workers: int = os.cpu_count() or 1
+    jobs: int = os.cpu_count() or 1
     """Runs side by side."""
     out: Path = Path("runs/safe-gym")
     """Folder of results; runs that are already there are not run again."""
+
+    def __post_init__(self) -> None:
+        check_grid(self, "envs", "libraries", "seeds")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +134,7 @@ def train_omnisafe(job: Run) -> list[dict[str, float]]:
 def jobs(config: Config) -> dict[Path, tuple[Run]]:
     """What to run, by the file of its results."""
     found = {}
-    for seed, env, library in product(range(config.seeds), config.envs, config.libraries):
+    for seed, env, library in product(config.seeds, config.envs, config.libraries):
         folder = config.out / library / env / str(seed)
         found[folder.with_suffix(".json")] = (
             Run(library, env, seed, config.frames, config.cost_limit, folder),
@@ -157,7 +160,7 @@ def table(runs: list[dict[str, Any]], config: Config) -> str:
 
 def main(config: Config) -> None:
     """Runs what is missing, then writes the table and a line of JSON for each run."""
-    runs = run_grid(run, jobs(config), workers=config.workers, name="safe-gym")
+    runs = run_grid(run, jobs(config), workers=config.jobs, name="safe-gym")
     lines = "".join(f"{json.dumps(run)}\n" for run in runs)
     write_whole(config.out / "results.jsonl", lines)
     text = table(runs, config)

@@ -24,7 +24,7 @@ from experiments.config import (
     suite_config,
 )
 from experiments.gallery import WITH_PERSON
-from experiments.grid import run_grid, save_results
+from experiments.grid import check_grid, run_grid, save_results
 from experiments.suite_report import plot_profiles, plot_training, report
 from torchrl_safe.envs import SUITE
 
@@ -51,14 +51,9 @@ class Config:
     """Folder of results; runs that are already there are not run again."""
 
     def __post_init__(self) -> None:
-        for name in ("tasks", "algorithms", "seeds"):
-            values = getattr(self, name)
-            if not values or len(set(values)) != len(values):
-                raise ValueError(f"{name} must name at least one, each once, got {values}.")
-        for name in ("frames", "jobs"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}.")
+        check_grid(self, "tasks", "algorithms", "seeds")
+        if self.frames is not None and self.frames < 1:
+            raise ValueError(f"frames must be at least 1, got {self.frames}.")
         if self.eval_episodes < 2:
             raise ValueError(f"eval_episodes must be at least 2, got {self.eval_episodes}.")
 

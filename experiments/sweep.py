@@ -22,7 +22,7 @@ from matplotlib.colors import to_hex
 
 from experiments import train
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, Observation
-from experiments.grid import run_grid, save_results
+from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import (
     Line,
     episode_costs,
@@ -49,8 +49,8 @@ class Config:
     """What the policy sees."""
     physics: Engine = "mujoco"
     """Engine that simulates the arm; bullet takes several times as long."""
-    seeds: int = 5
-    """Runs for each limit, with seeds from 0."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of the runs."""
     frames: int = TrainConfig.frames
     """Control steps to train for."""
     frames_per_batch: int = TrainConfig.frames_per_batch
@@ -61,10 +61,13 @@ class Config:
     """Logarithm of the policy's standard deviation at the start."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
-    workers: int = os.cpu_count() or 1
+    jobs: int = os.cpu_count() or 1
     """Runs side by side."""
     out: Path = Path("runs/sweep")
     """Folder of results; runs that are already there are not run again."""
+
+    def __post_init__(self) -> None:
+        check_grid(self, "actions", "limits", "seeds")
 
 
 def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
@@ -95,7 +98,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
 
 def names(config: Config) -> Iterable[tuple[int, Action, float | None]]:
     """Seed, action and limit of each run; no limit stands for PPO."""
-    return product(range(config.seeds), config.actions, (*config.limits, None))
+    return product(config.seeds, config.actions, (*config.limits, None))
 
 
 def table(runs: list[dict[str, Any]], config: Config) -> str:
@@ -154,11 +157,11 @@ def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
                 color=ALARM,
                 fontsize=8,
             )
-            for seed, limit in product(range(config.seeds), config.limits):
+            for (place, seed), limit in product(enumerate(config.seeds), config.limits):
                 (mine,) = (r for r in _select(runs, action, limit) if r["seed"] == seed)
                 value, low, high = mine["evaluation"]["cost/collision"]
                 # Beside each other, not on top of each other.
-                x = limit * 1.06 ** (seed - (config.seeds - 1) / 2)
+                x = limit * 1.06 ** (place - (len(config.seeds) - 1) / 2)
                 axis.plot([x, x], [low, high], color=hue, alpha=0.5)
                 axis.plot(x, value, "o", color=hue, ms=4)
             ppo = mean(episode_costs(_select(runs, action, None)).flatten().unsqueeze(-1))
@@ -211,7 +214,7 @@ def plot_curves(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
 
 def main(config: Config) -> None:
     """Runs what is missing, then writes table, figures and results.json."""
-    results = run_grid(train.run, jobs(config), workers=config.workers, name="sweep")
+    results = run_grid(train.run, jobs(config), workers=config.jobs, name="sweep")
     runs = [
         {"action": action, "limit": limit, "seed": seed, **result}
         for (seed, action, limit), result in zip(names(config), results, strict=True)

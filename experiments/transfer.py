@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from experiments import train
-from experiments.grid import run_grid, save_results
+from experiments.grid import check_grid, run_grid, save_results
 from torchrl_safe.envs import (
     SUITE,
     ArmState,
@@ -84,11 +84,9 @@ class Config:
     """Folder of results; what is already there is not played again."""
 
     def __post_init__(self) -> None:
-        if not self.conditions:
-            raise ValueError("conditions must name at least one, got none.")
-        for name, least in (("episodes", 2), ("jobs", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}.")
+        check_grid(self, "conditions")
+        if self.episodes < 2:
+            raise ValueError(f"episodes must be at least 2, got {self.episodes}.")
         if not self.chosen:
             raise ValueError("policies must name at least one: none comes with the package.")
 

@@ -3,6 +3,7 @@ import pytest
 from worlds import each_arm, rest, turn
 
 from torchrl_safe.envs import ArmEnv, Capsule, Collision, Human, Region, Sphere
+from torchrl_safe.envs.physics.paths import look_ahead
 
 pytestmark = pytest.mark.usefixtures("engine")
 
@@ -19,13 +20,14 @@ each_human = pytest.mark.parametrize("human", PEOPLE.values(), ids=PEOPLE.keys()
 
 
 def limbs(human, seed=0, seconds=30.0):
-    """Ends of upper arm and forearm and the head's centre, each ``(s, 3)``, at 240 Hz."""
+    """Shoulder, both ends at the elbow, hand and head's centre, each ``(s, 3)``, at 240 Hz."""
     path = human.sample(np.random.default_rng(seed), START, GOAL).at
     positions, orientations = path(np.arange(0, seconds, 1 / RATE))
     axes = turn(orientations, np.broadcast_to([0.0, 0.0, 1.0], positions.shape))
     ends = []
     for index, shape in enumerate(human.shapes[:2]):
-        half = shape.length / 2 * axes[:, index]
+        # The axis of the upper arm points to the shoulder, that of the forearm to the hand.
+        half = (-1, 1)[index] * shape.length / 2 * axes[:, index]
         ends += [positions[:, index] - half, positions[:, index] + half]
     return (*ends, positions[:, 2])
 
@@ -59,6 +61,19 @@ def test_the_hand_moves_smoothly(human, seed):
     assert speed.max() > 0.1
     # It waits before it sets out, at least for the shortest pause.
     assert (speed[: int(human.pause[0] * RATE) - 1] < 1e-9).all()
+
+
+@each_human
+@pytest.mark.parametrize("seed", range(3))
+def test_limbs_turn_as_fast_as_they_point_elsewhere(human, seed):
+    """They do not spin about their axes, not even where an upper arm hangs straight down."""
+    placement = human.sample(np.random.default_rng(seed), START, GOAL)
+    ways = look_ahead(placement, 0, 20 * RATE)
+    axes = turn(ways.orientation, np.broadcast_to([0.0, 0.0, 1.0], ways.position.shape))
+    changes = np.linalg.norm(np.diff(axes, axis=0), axis=-1) * RATE
+    spins = np.linalg.norm(ways.angular_velocity[1:], axis=-1)
+    assert changes[:, :2].max(axis=0).min() > 0.5
+    np.testing.assert_allclose(spins, changes, atol=0.5 + 0.2 * changes.max())
 
 
 def test_one_reach_by_hand():

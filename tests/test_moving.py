@@ -316,8 +316,12 @@ def test_what_moves_must_be_fixed(make_env):
         (lambda t: (np.zeros((len(t), 2, 3)), np.zeros((len(t), 2, 4))), r"positions of the path"),
         (lambda t: (np.full((len(t), 1, 3), np.nan), np.ones((len(t), 1, 4))), r"must be finite"),
         (lambda t: (np.ones((len(t), 1, 3)), np.ones((len(t), 4))), r"orientations of the path"),
+        (
+            lambda t: (np.ones((len(t), 1, 3)), np.ones((len(t), 1, 4))),
+            r"orientations of the path must be unit quaternions .*, got",
+        ),
     ],
-    ids=["count", "nan", "shape"],
+    ids=["count", "nan", "shape", "not-unit"],
 )
 def test_bad_paths(path, message):
     with pytest.raises(ValueError, match=message):

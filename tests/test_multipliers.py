@@ -536,7 +536,7 @@ def test_softplus_with_adam_is_the_rule_of_safety_gym():
 
 
 def test_softplus_cannot_start_at_zero():
-    with pytest.raises(ValueError, match=r"parametrization Softplus.*\[0\.0, 1\.0\]"):
+    with pytest.raises(ValueError, match=r"parametrization Softplus.*\[0\.0, 1\.0\]: pass another"):
         DualAscent(
             make_module(0.0, 1.0), cost_limit=1.0, lr=0.1, parametrization=SoftplusTransform()
         )

@@ -5,6 +5,7 @@ costs and returns of scripted policies), with tolerances for their number of epi
 """
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pybullet
@@ -18,7 +19,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_safe.envs import (
     PAPER_CARTESIAN,
     PAPER_JOINT,
-    Collision,
+    PAPER_SETTINGS,
     Proximity,
     Speed,
     paper_env,
@@ -115,8 +116,10 @@ def test_tool_pose_lags_one_substep(make_env):
 
 
 def test_gap_with_a_contact_point_costs(make_env):
-    """Bullet reports contact points from 2 cm before a touch: so the original counts."""
-    assert make_env(paper_env).costs == {"collision": Collision(margin=0.02)}
+    """Bullet reports contact points before a touch: so the original counts."""
+    (cost,) = make_env(paper_env).costs.values()
+    distances = np.array([[np.inf], [0.0015], [-0.001]])
+    assert cost(SimpleNamespace(contact_distance=distances)).tolist() == [0, 1, 1]
 
 
 def test_fourth_component_is_the_fingers_position(make_env):
@@ -175,7 +178,7 @@ def test_going_around_costs_nothing(make_env):
 
 def test_measuring_changes_nothing(make_env):
     """Not even where the tool is read one substep late."""
-    costs = {"collision": Collision(margin=0.02), "speed": Speed(), "near": Proximity()}
+    costs = {**PAPER_SETTINGS["costs"], "speed": Speed(), "near": Proximity()}
     plain, measured = make_env(paper_env, seed=0), make_env(paper_env, seed=0, costs=costs)
     ahead = lambda td: td.set("action", torch.full((1, 4), 0.3))  # noqa: E731
     expected, got = (env.rollout(60, ahead)["next"] for env in (plain, measured))

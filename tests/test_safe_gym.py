@@ -283,6 +283,12 @@ def test_in_a_collector(make_env, make):
     assert data["next", "episode_reward"][done].tolist() == [100] * 5 * rows
 
 
+def test_costs_have_the_names_of_their_keys(make_env):
+    env = make_env(SafeGymWrapper, Counting(), cost_keys=["cost", ("costs", "heat")])
+    assert env.cost_names == ("cost", "costs.heat")
+    assert make_env(SafeGymEnv, "counting:Counting-v0").cost_names == ("cost",)
+
+
 def test_a_step_without_a_cost_raises(make_env):
     env = make_env(SafeGymEnv, "counting:Forgetful-v0")
     with pytest.raises(KeyError, match=r"info must have \('cost',\) in every step, got only \[\]"):

@@ -4,15 +4,18 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+import torch
 from worlds import ARMS, Places, each_arm, home_of, rest, step
 
 from torchrl_safe.envs import (
+    PANDA,
     ArmEnv,
     Box,
     Bullet,
     CartesianDelta,
     Collision,
     ContactForce,
+    Cylinder,
     InFront,
     JointDelta,
     JointLimit,
@@ -33,7 +36,7 @@ from torchrl_safe.envs.state import Trace
 pytestmark = pytest.mark.usefixtures("engine")
 
 EVERYTHING = {
-    "table": Collision(margin=0.02, table=True),
+    "table": Collision(table=True),
     "itself": Collision(itself=True),
 }
 
@@ -205,6 +208,46 @@ def test_clearance_is_a_distance_between_surfaces(make_env, turntable, centre, e
         clearance = env.arm_state.trace["clearance"]
         np.testing.assert_allclose(clearance, np.full((1, 12, 1), expected), atol=5e-4)
         assert cost in (None, pytest.approx(max(0, 0.45 - expected), abs=5e-4))
+
+
+@pytest.mark.parametrize("gap", [0.015, 0.025])
+def test_what_is_nearer_than_the_margin_counts_as_a_touch(make_env, turntable, gap):
+    """Contacts begin a millimetre or two before a touch, so they cannot tell."""
+    turntable["obstacles"] = Places(Sphere(0.1), at=[(0.6 + gap, 0, 0.5)])
+    env = make_env(ArmEnv, **turntable, costs={"near": Collision(margin=0.02)})
+    env.reset()
+    assert rest(env)["cost"].item() == (gap < 0.02)
+
+
+def test_what_is_only_measured_pushes_no_less(make_env):
+    """A cylinder is driven into the hand, and moves the arm the same whatever is measured."""
+    start = home_of(PANDA)
+
+    def path(times):
+        ways = np.outer(times, (-0.1, 0, 0))[:, None] + (start[0] + 0.15, start[1], 0.1)
+        return ways, np.broadcast_to((0.0, 0, 0, 1), (len(times), 1, 4))
+
+    rollouts = []
+    for costs in (
+        {},
+        {"apart": SpeedAndSeparation(), "near": Proximity(margin=0.3)},
+        {"near": Collision(margin=0.1), "limit": JointLimit(), "speed": Speed()},
+    ):
+        env = make_env(
+            ArmEnv,
+            action=JointDelta(),
+            obstacles=Places(Cylinder(), at=path(np.zeros(1))[0][0], path=path),
+            costs={"touch": Collision(), "force": ContactForce(), **costs},
+            max_episode_steps=60,
+            seed=0,
+        )
+        still = torch.zeros(1, 7)
+        rollouts.append(env.rollout(60, lambda td: td.set("action", still))["next"])  # noqa: B023
+    plain, *others = rollouts
+    assert plain["cost"][..., 0].sum() > 10
+    for other in others:
+        assert torch.equal(other["observation"], plain["observation"])
+        assert torch.equal(other["cost"][..., :2], plain["cost"])
 
 
 def test_obstacles_that_are_absent_are_infinitely_far(make_env, turntable):

@@ -9,7 +9,7 @@ from PIL import Image
 from experiments import compare, multiplier_profile, sweep
 from experiments.grid import missing
 
-SMALL = {"seeds": 1, "frames": 4096, "eval_episodes": 32, "workers": 2}
+SMALL = {"seeds": (0,), "frames": 4096, "eval_episodes": 32, "jobs": 2}
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_sweep_leaves_table_figure_and_results(swept):
         with Image.open(swept.out / f"{name}.png") as image:
             assert image.width > 500
     assert not missing(sweep.jobs(swept))
-    assert len(missing(sweep.jobs(dataclasses.replace(swept, seeds=3)))) == 4
+    assert len(missing(sweep.jobs(dataclasses.replace(swept, seeds=(0, 1, 2))))) == 4
 
 
 @pytest.mark.parametrize("script", [compare, sweep, multiplier_profile])
@@ -62,7 +62,7 @@ def made_up(limit, seed, costs, success):
 
 
 def test_sweep_counts_the_seeds_that_keep_the_limit():
-    config = sweep.Config(limits=(2.0,), actions=("joint",), seeds=2)
+    config = sweep.Config(limits=(2.0,), actions=("joint",), seeds=(0, 1))
     runs = [
         made_up(2.0, 0, [0, 4], 1.0),  # exactly the limit
         made_up(2.0, 1, [1, 4], 0.5),
@@ -82,7 +82,7 @@ def test_profile_runs_fixed_multipliers(tmp_path):
     (run,) = json.loads((tmp_path / "results.json").read_text())["runs"]
     assert (run["rule"], run["value"]) == ("fixed", 4.0)
     assert {row["multiplier/collision"] for row in run["history"]} == {4.0}
-    config = dataclasses.replace(config, limits=(0.5,), seeds=2)
+    config = dataclasses.replace(config, limits=(0.5,), seeds=(0, 1))
     assert [path.name for path in missing(multiplier_profile.jobs(config))] == [
         "dual-ascent-0.5-0.json", "pid-0.5-0.json",
         "fixed-4-1.json", "dual-ascent-0.5-1.json", "pid-0.5-1.json",
@@ -140,13 +140,13 @@ def test_comparison_has_a_row_for_each_algorithm(tmp_path):
 
 
 def test_comparison_has_settings_and_limits_of_their_own_for_some(tmp_path):
-    jobs = compare.jobs(compare.Config(seeds=1, out=tmp_path))
+    jobs = compare.jobs(compare.Config(seeds=(0,), out=tmp_path))
     settings = {algorithm: config for config, algorithm in jobs.values()}
     assert len(settings) == 17
     assert settings["ppo"].frames == settings["ppo-lagrangian"].frames == 128_000
     assert settings["a2c-lagrangian"].frames_per_batch == 512
     assert {n for n, c in settings.items() if c.cost_limit == 2} == {*compare.BUDGETS}
-    higher = compare.jobs(compare.Config(seeds=1, cost_limit=5.0, out=tmp_path))
+    higher = compare.jobs(compare.Config(seeds=(0,), cost_limit=5.0, out=tmp_path))
     assert {config.cost_limit for config, _ in higher.values()} == {5.0}
 
 
@@ -157,6 +157,15 @@ def test_comparison_trains_what_it_is_told(tmp_path):
     runs = json.loads((tmp_path / "results.json").read_text())["runs"]
     assert [run["algorithm"] for run in runs] == ["ppo", "cpo"]
     assert not missing(compare.jobs(config))
-    assert [path.name for path in missing(compare.jobs(dataclasses.replace(config, seeds=2)))] == [
+    more = dataclasses.replace(config, seeds=(0, 1))
+    assert [path.name for path in missing(compare.jobs(more))] == [
         "ppo-1.json", "cpo-1.json",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("config", [compare.Config, sweep.Config, multiplier_profile.Config])
+def test_a_grid_of_no_seed_or_no_process_is_refused(config):
+    with pytest.raises(ValueError, match=r"seeds must name at least one, each once, got \(\)"):
+        config(seeds=())
+    with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
+        config(jobs=0)

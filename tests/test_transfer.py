@@ -221,7 +221,7 @@ def test_costs_above_their_limits_are_bold():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"conditions": ()}, "conditions must name at least one, got none"),
+        ({"conditions": ()}, r"conditions must name at least one, each once, got \(\)"),
         ({"episodes": 1}, "episodes must be at least 2, got 1"),
         ({"jobs": 0}, "jobs must be at least 1, got 0"),
     ],

@@ -102,9 +102,11 @@ def test_a_limit_of_the_wrong_length_is_refused(shape):
 def test_what_cannot_be_a_limit_or_a_loss_is_refused():
     with pytest.raises(ValueError, match="cost_limit must be finite, got nan"):
         make(cost_limit=float("nan"))
-    with pytest.raises(ValueError, match="PPOLagrangianLoss has no cost_violation buffer"):
+    with pytest.raises(ValueError, match=r"has no cost_violation buffer\. Use PIDControl or Dual"):
         ViolationUpdater(make_loss(), cost_limit=1.0)
-    with pytest.raises(ValueError, match="LossModule has no cost_violation buffer"):
+    with pytest.raises(ValueError, match=r"P3OLoss has no lagrange_multiplier buffer\. Use Violat"):
+        PIDControl(P3OLoss(*make_networks(), num_costs=1), cost_limit=1.0)
+    with pytest.raises(ValueError, match=r"LossModule has no cost_violation buffer\.$"):
         ViolationUpdater(LossModule(), cost_limit=1.0)
     with pytest.raises(ValueError, match="must be a LossModule, got "):
         ViolationUpdater(torch.nn.Linear(1, 1), cost_limit=1.0)

@@ -7,16 +7,12 @@ contacts says so by :attr:`~torchrl_safe.envs.state.Sensor.sensing`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Real
 
 import numpy as np
 
 from torchrl_safe._checks import check_flag, check_kind, check_not_negative, check_positive
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.state import ArmState, Array, Sensing
-
-#: Largest distance of a contact point, m.
-CONTACT_RANGE = 0.02
 
 
 @dataclass(frozen=True)
@@ -26,20 +22,20 @@ class Collision:
     .. math::
         c = \mathbb{1}[\min_{t, i} d_{t,i} \le \text{margin}]
 
-    with d the distance (m) of the contact points between any link of the arm and any obstacle i
-    in any physics substep t. A touch that begins and ends between two control steps counts too.
-    (Engines find contacts at the beginning of a substep, so the very last state of an episode is
-    not checked.) Kovač & Farkaš 2023 and Safety Gym (Ray et al. 2019) use this cost.
+    with d the distance (m) between the arm and obstacle i in physics substep t. A touch that begins
+    and ends between two control steps counts too. (Without a margin the engine's contacts tell.
+    They are found at the beginning of a substep, so the very last state of an episode is not
+    checked.) Kovač & Farkaš 2023 and Safety Gym (Ray et al. 2019) use this cost.
 
     Args:
-        margin: distance up to which a contact point counts as a touch, m. There are
-            contact points from 0.02 m before the bodies meet.
-        table: count the table too (not what the base stands on).
+        margin: distance from an obstacle that counts as a touch, m. It is measured, which takes
+            time.
+        table: count touches of the table too (not of what the base stands on).
         itself: count links of the arm that touch each other, unless they overlap at home. Links
             then collide; without it they pass through each other.
 
     Raises:
-        ValueError: if ``margin`` is not between 0 and 0.02.
+        ValueError: if ``margin`` is negative or not finite.
 
     Examples:
         >>> Collision(table=True)
@@ -51,25 +47,23 @@ class Collision:
     itself: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.margin, Real) or not 0 <= self.margin <= CONTACT_RANGE:
-            raise ValueError(
-                f"margin must be between 0 and {CONTACT_RANGE}, where contact points begin, "
-                f"got {self.margin}."
-            )
+        check_not_negative(margin=self.margin)
         check_flag(table=self.table, itself=self.itself)
 
     @property
     def sensing(self) -> Sensing:
-        return Sensing(table=self.table, itself=self.itself)
+        return Sensing(clearance=self.margin, table=self.table, itself=self.itself)
 
     def __call__(self, state: ArmState) -> Array:
         """Returns the cost of each world, shape ``(N,)``."""
-        distances = [state.contact_distance]
+        touches = (state.contact_distance <= 0).any(axis=1)
+        if self.margin:
+            touches |= (state.trace["clearance"] <= self.margin).any(axis=(1, 2))
         if self.table:
-            distances.append(state.trace["table_distance"])
+            touches |= (state.trace["table_distance"] <= 0).any(axis=1)
         if self.itself:
-            distances.append(state.trace["self_distance"])
-        return (np.concatenate(distances, axis=1) <= self.margin).any(axis=1).astype(float)
+            touches |= (state.trace["self_distance"] <= 0).any(axis=1)
+        return touches.astype(float)
 
 
 @dataclass(frozen=True)

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta
 from torchrl_safe.envs.arm_env import ArmEnv
 from torchrl_safe.envs.arms import PANDA
-from torchrl_safe.envs.costs import CONTACT_RANGE, Collision
 from torchrl_safe.envs.observations import paper_observation
 from torchrl_safe.envs.obstacles import InFront
 from torchrl_safe.envs.obstacles.shapes import Cylinder
 from torchrl_safe.envs.physics.bullet import Bullet, BulletInverseKinematics
 from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.state import ArmState, Array
 from torchrl_safe.envs.tasks import Reach
 
 #: AR1: displacements of the tool point and the position of the fingers, not clipped.
@@ -32,13 +34,26 @@ PAPER_CARTESIAN = CartesianDelta(
 #: AR2: increments of the seven joints, not clipped.
 PAPER_JOINT = JointDelta(step=0.1, bound=math.inf, respect_limits=False)
 
+
+@dataclass(frozen=True)
+class AnyContactPoint:
+    """Costs 1 for every control step with a contact point, also one that is still a gap.
+
+    Bullet has contact points a millimetre or two before a touch, further for large shapes.
+    """
+
+    def __call__(self, state: ArmState) -> Array:
+        """Returns the cost of each world, shape ``(N,)``."""
+        return np.isfinite(state.contact_distance).any(axis=1).astype(float)
+
+
 #: Arguments of :class:`~torchrl_safe.envs.ArmEnv`, all but the action.
 PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
     {
         "arm": replace(PANDA, home=(0, -0.215, 0, -2.57, 0, 2.356, 2.356), finger_home=0.08),
         "task": Reach(Region((0.6, -0.2, 0.05), (0.8, 0.2, 0.05)), radius=0.09, order=1),
         "obstacles": InFront(gap=0.2, shape=Cylinder(mass=1.0), direction=(1, 0, 0), height=0.05),
-        "costs": {"collision": Collision(margin=CONTACT_RANGE)},
+        "costs": {"collision": AnyContactPoint()},
         "observation": paper_observation,
         "frame_skip": 1,
         "max_episode_steps": 500,

@@ -41,6 +41,11 @@ class _CostBesideReward(GymWrapper):
         super().__init__(*args, **kwargs)
 
     @property
+    def cost_names(self) -> tuple[str, ...]:
+        """Names of the costs, one for each column of ``cost``: ``cost_keys``, joined by dots."""
+        return tuple(".".join(path) for path in self._cost_paths)
+
+    @property
     def reward_key(self) -> str:
         """Key of the reward alone: TorchRL's own code writes the reward there."""
         return "reward"

@@ -132,7 +132,8 @@ class Human:
         positions = np.stack([(shoulder + elbow) / 2, (elbow + hand) / 2, head], axis=1)
         axes = np.stack(
             [
-                (elbow - shoulder) / _UPPER_ARM,
+                # Upwards: from_z_axis is singular at -z, where a hanging upper arm points.
+                (shoulder - elbow) / _UPPER_ARM,
                 (hand - elbow) / _FOREARM,
                 np.broadcast_to((0.0, 0.0, 1.0), hand.shape),
             ],

@@ -71,10 +71,7 @@ class Placement:
             ),
             "present": present,
         }
-        if (np.abs(np.linalg.norm(filled["orientation"], axis=1) - 1) > 1e-3).any():
-            raise ValueError(
-                f"orientation must be unit quaternions (x, y, z, w), got {self.orientation}."
-            )
+        _check_unit("orientation", filled["orientation"])
         for name, value in filled.items():
             object.__setattr__(self, name, value)
 
@@ -82,19 +79,27 @@ class Placement:
         """Returns positions ``(s, m, 3)`` and orientations ``(s, m, 4)`` at times ``(s,)``.
 
         Raises:
-            ValueError: if the path has the wrong shape or is not finite.
+            ValueError: if the path has the wrong shape or is not finite, or an orientation is not
+                a unit quaternion.
         """
         repeats, count = len(times), len(self.position)
         if self.path is not None:
-            positions, orientations = self.path(times)
-            return (
-                check_array("positions of the path", positions, (repeats, count, 3)),
-                check_array("orientations of the path", orientations, (repeats, count, 4)),
-            )
+            places, turns = self.path(times)
+            places = check_array("positions of the path", places, (repeats, count, 3))
+            turns = check_array("orientations of the path", turns, (repeats, count, 4))
+            _check_unit("orientations of the path", turns)
+            # The path may keep what it returns, and simulators write where obstacles are absent.
+            return places.copy(), turns.copy()
         return (
             np.repeat(self.position[None], repeats, axis=0),
             np.repeat(self.orientation[None], repeats, axis=0),
         )
+
+
+def _check_unit(name: str, orientation: Array) -> None:
+    wrong = np.abs(np.linalg.norm(orientation, axis=-1) - 1) > 1e-3
+    if wrong.any():
+        raise ValueError(f"{name} must be unit quaternions (x, y, z, w), got {orientation[wrong]}.")
 
 
 @runtime_checkable

@@ -12,6 +12,12 @@ from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives._checks import as_number, as_tensor, check_number
 
+#: Which updaters write which buffer of a loss.
+_UPDATERS = {
+    "lagrange_multiplier": "PIDControl or DualAscent",
+    "cost_violation": "ViolationUpdater",
+}
+
 
 class CostUpdater(abc.ABC):
     """Checks episode costs, and lets :meth:`_move` write one buffer of a loss in place.
@@ -39,9 +45,13 @@ class CostUpdater(abc.ABC):
     ) -> None:
         if not isinstance(loss_module, LossModule):
             raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
-        buffer = dict(loss_module.named_buffers(recurse=False)).get(self.buffer_name)
+        buffers = dict(loss_module.named_buffers(recurse=False))
+        buffer = buffers.get(self.buffer_name)
         if buffer is None:
-            raise ValueError(f"{type(loss_module).__name__} has no {self.buffer_name} buffer.")
+            hints = [f" Use {_UPDATERS[name]}." for name in _UPDATERS if name in buffers]
+            raise ValueError(
+                f"{type(loss_module).__name__} has no {self.buffer_name} buffer.{''.join(hints)}"
+            )
         self.loss_module = loss_module
         self.cost_names = check_names(cost_names, len(buffer))
         self._has_names = cost_names is not None
@@ -93,10 +103,11 @@ class CostUpdater(abc.ABC):
         if not isinstance(episode_cost, Tensor):
             raise TypeError(f"episode_cost must be a tensor, got {episode_cost!r}.")
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:
-            shape = tuple(episode_cost.shape)
+            names = f" ({', '.join(self.cost_names)})" if self._has_names else ""
             raise ValueError(
                 f"episode_cost must have shape (E, {len(buffer)}), a row for each episode that "
-                f"ended and a column for each cost ({', '.join(self.cost_names)}), got {shape}."
+                f"ended and a column for each cost{names}, got {tuple(episode_cost.shape)}. With a "
+                'collector: batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)].'
             )
         if not (usable := episode_cost.isfinite().all(0)).all():
             raise ValueError(

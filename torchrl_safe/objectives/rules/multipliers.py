@@ -234,7 +234,7 @@ class DualAscent(MultiplierUpdater):
         if not parametrization.inv(multiplier).isfinite().all():
             raise ValueError(
                 f"parametrization {parametrization} cannot give the multiplier to start with, "
-                f"{multiplier.tolist()}."
+                f"{multiplier.tolist()}: pass another multiplier_init to the loss."
             )
         self.parametrization = parametrization
         self._parameter = torch.zeros_like(multiplier)

@@ -90,6 +90,18 @@ def read_arm(
     return spec, parts
 
 
+def name_solids(spec: Any) -> dict[str, str]:
+    """Names the shapes of an arm that collide; returns each with the name of its body."""
+    solids = {}
+    for body in spec.bodies[1:]:
+        for geom in body.geoms:
+            # Shapes that are only drawn have neither.
+            if geom.contype or geom.conaffinity:
+                geom.name = f"arm/{len(solids)}"
+                solids[geom.name] = body.name
+    return solids
+
+
 def _rename_world(root: ElementTree.Element) -> None:
     """Gives a root link that is called like MuJoCo's own a body to itself."""
     for element in root.iter():

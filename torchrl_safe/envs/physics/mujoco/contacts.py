@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import combinations
 from typing import Any
 
@@ -79,27 +79,6 @@ def _set(geom: Any, kind: int, others: int) -> None:
     geom.friction = (_FRICTION**2, _SPIN, _ROLL)
     geom.solref = STIFF
     geom.margin = 0.0
-
-
-def measure_base(spec: Any, moving: str, obstacles: Sequence[str], *, reach: float) -> None:
-    """Measures obstacles against the fixed part of the arm, which MuJoCo does not test by itself.
-
-    Args:
-        spec: the world; changed in place.
-        moving: name of the first body that a joint moves.
-        obstacles: names of the obstacles' shapes.
-        reach: distance from which on they are found, m.
-    """
-    base = spec.body(moving).parent
-    while base.name != "world":
-        for number, geom in enumerate(base.geoms):
-            if not (geom.contype or geom.conaffinity):
-                continue
-            geom.name = geom.name or f"{base.name}/{number}"
-            for name in obstacles:
-                # Forces begin at a depth that never occurs.
-                spec.add_pair(geomname1=geom.name, geomname2=name, margin=-1, gap=1 + reach)
-        base = base.parent
 
 
 def exclude_overlaps(spec: Any, arm: set[str], model: Any, data: Any) -> None:

@@ -11,18 +11,16 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
-from torchrl_safe.envs.physics.mujoco.arm import ArmParts, read_arm
+from torchrl_safe.envs.physics.mujoco.arm import ArmParts, name_solids, read_arm
 from torchrl_safe.envs.physics.mujoco.bodies import (
     add_object,
     add_obstacle,
     add_parts,
     add_table,
-    obstacle,
 )
 from torchrl_safe.envs.physics.mujoco.contacts import (
     exclude_overlaps,
     exclude_unreachable,
-    measure_base,
     set_options,
 )
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
@@ -74,12 +72,10 @@ def build_world(
     except ValueError as error:
         raise ValueError(f"urdf {arm.urdf!r} does not load in MuJoCo: {error}") from error
     set_options(spec, scene.gravity)
-    _add_bodies(spec, shapes, objects, reach=max(CONTACT_RANGE, sensing.clearance))
-    if sensing.clearance:
-        fixed = [obstacle(index) for index, shape in enumerate(shapes) if not shape.mass]
-        measure_base(spec, parts.moving, fixed, reach=sensing.clearance)
+    solids = name_solids(spec)
+    _add_bodies(spec, shapes, objects, reach=CONTACT_RANGE)
     add_motors(spec, parts, limited=scene.motor_limits, strength=scene.motor_strength)
-    sensors = Sensors(spec, parts, shapes, sensing)
+    sensors = Sensors(spec, parts, solids, shapes, sensing)
     model, data = _at_home(spec, arm, parts)
     exclude_overlaps(spec, links, model, data)
     exclude_unreachable(spec, links, model, data, reach=CONTACT_RANGE)

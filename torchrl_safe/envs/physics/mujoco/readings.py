@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.arm import ArmParts
@@ -17,7 +16,7 @@ from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.state import Array, Sensing
 from torchrl_safe.envs.vectors import cross
 
-#: Distance from which on contacts are reported, m, as PyBullet does.
+#: Distance from which on contacts are found, m; forces begin at a touch.
 CONTACT_RANGE = 0.02
 # Of one obstacle; of more contacts at once the shallowest are not counted.
 _SLOTS = 16
@@ -45,6 +44,7 @@ class Sensors:
     Args:
         spec: the world; changed in place.
         parts: of the arm.
+        solids: the arm's shapes that collide, see :func:`~.arm.name_solids`.
         shapes: the obstacles.
         sensing: what is measured in every substep besides contacts.
     """
@@ -53,6 +53,7 @@ class Sensors:
         self,
         spec: Any,
         parts: ArmParts,
+        solids: Mapping[str, str],
         shapes: Sequence[Shape],
         sensing: Sensing,
     ) -> None:
@@ -63,8 +64,7 @@ class Sensors:
         frame = mujoco.mjtObj.mjOBJ_XBODY
         self._add_contacts("contacts", shapes, slots=_SLOTS, data=("FOUND", "FORCE", "DIST"))
         if sensing.clearance:
-            data = ("FOUND", "DIST", "POS", "NORMAL", "LINVEL")
-            self._add_contacts("nearest", shapes, slots=1, data=data, base=True)
+            self._add_distances(solids, shapes, sensing.clearance)
         if sensing.table:
             self._add_touch("table_distance", parts.moving, mujoco.mjtObj.mjOBJ_GEOM, TABLE)
         if sensing.itself:
@@ -88,18 +88,36 @@ class Sensors:
         self.places[name] = Place(slice(self._width, self._width + width), shape)
         self._width += width
 
-    def _add_contacts(
-        self,
-        name: str,
-        shapes: Sequence[Shape],
-        *,
-        slots: int,
-        data: Sequence[str],
-        base: bool = False,
+    def _add_distances(
+        self, solids: Mapping[str, str], shapes: Sequence[Shape], reach: float
     ) -> None:
-        """Contacts of each obstacle with the arm, its base included on demand, or if it is free."""
+        """Distances of all shapes of the arm from each obstacle, and how the shapes move.
+
+        Contacts cannot tell them: with a wide gap MuJoCo gets the normals of overlaps wrong.
+        """
+        kinds = mujoco.mjtSensor
+        for index in range(len(shapes)):
+            for name in solids:
+                self._spec.add_sensor(
+                    type=kinds.mjSENS_GEOMFROMTO,
+                    objtype=mujoco.mjtObj.mjOBJ_GEOM,
+                    objname=name,
+                    reftype=mujoco.mjtObj.mjOBJ_GEOM,
+                    refname=obstacle(index),
+                    cutoff=reach,
+                )
+        self._note("closest", (len(shapes), len(solids), 2, 3))
+        for body in solids.values():
+            for kind in (kinds.mjSENS_FRAMEPOS, kinds.mjSENS_FRAMELINVEL, kinds.mjSENS_FRAMEANGVEL):
+                self._spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body)
+        self._note("motions", (len(solids), 3, 3))
+
+    def _add_contacts(
+        self, name: str, shapes: Sequence[Shape], *, slots: int, data: Sequence[str]
+    ) -> None:
+        """Contacts of each obstacle with the arm, its base included if the obstacle is free."""
         for index, shape in enumerate(shapes):
-            arm = self._parts.root if base or shape.mass else self._parts.moving
+            arm = self._parts.root if shape.mass else self._parts.moving
             self._add_contact(arm, mujoco.mjtObj.mjOBJ_GEOM, obstacle(index), slots, data)
         width = sum(_WIDTHS[part] for part in data)
         self._note(name, (len(shapes), slots, width))
@@ -123,7 +141,7 @@ class Sensors:
 
 
 # Of what a contact sensor can tell, in its order.
-_WIDTHS = {"FOUND": 1, "FORCE": 3, "DIST": 1, "POS": 3, "NORMAL": 3, "LINVEL": 3}
+_WIDTHS = {"FOUND": 1, "FORCE": 3, "DIST": 1}
 
 
 def touches(data: Array) -> tuple[Array, Array]:
@@ -154,26 +172,31 @@ def touch_distance(data: Array) -> Array:
     return np.where(data[..., 0] > 0, data[..., 1], np.inf)
 
 
-def nearest(data: Array, reach: float, ways: Ways, free: NDArray[np.bool_]) -> dict[str, Array]:
+def nearest(closest: Array, motions: Array, ways: Ways) -> dict[str, Array]:
     """Clearance, m, and the speeds at which the closest points approach each other, m/s.
 
     Args:
-        data: readings of the nearest contact with each obstacle, ``(..., m, 1, 11)``.
-        reach: distance up to which it counts, m.
+        closest: the closest points of each of the g shapes of the arm and each obstacle, on the arm
+            and on the obstacle, m, ``(..., m, g, 2, 3)``; zeros where they are out of reach.
+        motions: centre, velocity and angular velocity of each shape's body, ``(..., g, 3, 3)``.
         ways: the obstacles at the same time, ``(..., m, width)``.
-        free: which obstacles physics moves, ``(m,)``.
     """
-    found, distance, *rest = np.split(data[..., 0, :], (1, 2, 5, 8), axis=-1)
-    point, normal, velocity = rest
-    near = (found[..., 0] > 0) & (distance[..., 0] <= reach)
-    # The normal points from the arm to the obstacle. It does not matter that the point lies
-    # between the two: along the normal all points of a body are equally fast.
-    turned = cross(ways.position - point, ways.angular_velocity)
-    obstacle = -((ways.velocity + turned) * normal).sum(axis=-1)
-    closing = -velocity[..., 0]
-    # To MuJoCo, what is put in its places from outside does not move.
+    way = closest[..., 1, :] - closest[..., 0, :]
+    apart = np.sqrt(np.einsum("...i,...i->...", way, way))
+    # Where they overlap, the two points have changed sides.
+    inwards = ways.position[..., None, :] - closest[..., 1, :]
+    apart = np.where(np.einsum("...i,...i->...", inwards, way) < 0, -apart, apart)
+    apart = np.where(apart == 0, np.inf, apart)
+    shape = apart.argmin(axis=-1)[..., None]
+    clearance = np.take_along_axis(apart, shape, axis=-1)
+    normal = np.take_along_axis(way, shape[..., None], axis=-2)[..., 0, :] / clearance
+    points = np.take_along_axis(closest, shape[..., None, None], axis=-3)[..., 0, :, :]
+    moves = np.take_along_axis(motions, shape[..., None], axis=-3)
+    centre, velocity, spin = (moves[..., part, :] for part in range(3))
+    arm = velocity + cross(spin, points[..., 0, :] - centre)
+    obstacle = ways.velocity + cross(ways.angular_velocity, points[..., 1, :] - ways.position)
     return {
-        "clearance": np.where(near, distance[..., 0], np.inf),
-        "arm_approach": np.where(near, closing - np.where(free, obstacle, 0), 0.0),
-        "obstacle_approach": np.where(near, obstacle, 0.0),
+        "clearance": clearance[..., 0],
+        "arm_approach": np.einsum("...i,...i->...", arm, normal),
+        "obstacle_approach": -np.einsum("...i,...i->...", obstacle, normal),
     }

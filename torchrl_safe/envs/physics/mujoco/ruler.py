@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
-from torchrl_safe.envs.physics.mujoco.arm import read_arm
+from torchrl_safe.envs.physics.mujoco.arm import name_solids, read_arm
 from torchrl_safe.envs.physics.mujoco.bodies import TABLE, add_obstacle, obstacle
 from torchrl_safe.envs.physics.mujoco.contacts import level_bodies
 from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
@@ -62,15 +62,7 @@ class Ruler:
         # Nothing exerts forces here.
         idle = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         spec.option.disableflags |= int(idle)
-        solid = [
-            geom
-            for body in spec.bodies[1:]
-            for geom in body.geoms
-            if geom.contype or geom.conaffinity
-        ]
-        for number, geom in enumerate(solid):
-            geom.name = f"arm/{number}"
-        names = [geom.name for geom in solid]
+        names = list(name_solids(spec))
         # A plane without edges: several times as fast as a box.
         spec.worldbody.add_geom(name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
         for index, shape in enumerate(shapes):

@@ -279,8 +279,7 @@ class MuJoCoSimulator:
         trace: dict[str, Array] = {}
         if sensing.clearance:
             assert ways is not None
-            reading = places["nearest"].of(after)
-            trace |= nearest(reading, sensing.clearance, ways, self._is_free)
+            trace |= nearest(places["closest"].of(after), places["motions"].of(after), ways)
         for name in ("table_distance", "self_distance"):
             if name in places:
                 trace[name] = touch_distance(places[name].of(contacts))
