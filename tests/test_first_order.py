@@ -10,7 +10,8 @@ from on_policy import estimated, make_loss
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from tensordict.utils import unravel_key
-from torch.distributions import kl_divergence
+from torch.distributions import Categorical, Independent, kl_divergence
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, PPOLoss, SoftUpdate
 from torchrl.objectives.value import TD0Estimator
@@ -23,6 +24,8 @@ from torchrl_safe.objectives import (
     IPOLoss,
     P3OLoss,
     PIDControl,
+    PPOLagrangianLoss,
+    TrustRegionLoss,
     ViolationUpdater,
     penalized_advantage,
 )
@@ -657,6 +660,15 @@ def test_an_argument_that_cannot_be_used_is_named(make, argument, value):
         make(*make_networks(), **{argument: value})
 
 
+@pytest.mark.parametrize(
+    "make", [PPOLagrangianLoss, TrustRegionLoss, FOCOPSLoss, CUPLoss, P3OLoss, IPOLoss]
+)
+def test_an_argument_that_does_not_exist_is_refused(make):
+    """TorchRL's PPOLoss would ignore it, a limit too."""
+    with pytest.raises(TypeError, match=r"unexpected arguments: clip_epsilom, cost_limit"):
+        make(*make_networks(), cost_limit=25.0, clip_epsilom=0.1)
+
+
 @every_loss
 def test_a_batch_without_cost_is_refused(make):
     loss = build(make)
@@ -724,24 +736,31 @@ def test_crpo_wraps_any_advantage_loss():
         crpo(*make_networks(), normalize_advantage=True)
 
 
+def two_masked(logits, mask):
+    """Two choices among three actions each."""
+    each = MaskedCategorical(logits=logits.unflatten(-1, (2, 3)), mask=mask.unflatten(-1, (2, 3)))
+    return Independent(each, 1)
+
+
+@pytest.mark.parametrize(("distribution", "width"), [(MaskedCategorical, 3), (two_masked, 6)])
 @pytest.mark.parametrize("make", [FOCOPSLoss, CUPLoss])
-def test_a_masked_action_leaves_the_gradients_finite(make):
+def test_a_masked_action_leaves_the_gradients_finite(make, distribution, width):
     """PyTorch's divergence of two policies that exclude the same action has a gradient of NaN."""
-    net = TensorDictModule(torch.nn.Linear(4, 3), ["observation"], ["logits"])
+    net = TensorDictModule(torch.nn.Linear(4, width), ["observation"], ["logits"])
     actor = ProbabilisticActor(
-        net, ["logits", "mask"], distribution_class=MaskedCategorical, return_log_prob=True
+        net, ["logits", "mask"], distribution_class=distribution, return_log_prob=True
     )
     loss = make(actor, make_critic(), make_critic("cost_value"), multiplier_init=1.0)
     batch = TensorDict(
         observation=torch.randn(8, 4),
-        mask=torch.tensor([True, True, False]).expand(8, 3),
+        mask=torch.tensor([True, True, False]).repeat(8, width // 3),
         advantage=torch.randn(8, 1),
         cost_advantage=torch.randn(8, 1),
         value_target=torch.zeros(8, 1),
         cost_value_target=torch.zeros(8, 1),
         batch_size=8,
     )
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         actor(batch)
     phases = [loss]
     if make is CUPLoss:
@@ -751,6 +770,13 @@ def test_a_masked_action_leaves_the_gradients_finite(make):
         losses = phase(batch)
         sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())
+
+
+def test_the_divergence_of_independent_categories_is_pytorchs():
+    logits = torch.randn(2, 5, 2, 3, generator=torch.Generator().manual_seed(0))
+    for summed in (0, 1, 2):
+        old, new = (Independent(Categorical(logits=each), summed) for each in logits)
+        torch.testing.assert_close(divergence(old, new), kl_divergence(old, new))
 
 
 def test_the_divergence_of_categories_is_pytorchs():

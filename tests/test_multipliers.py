@@ -481,6 +481,15 @@ def test_a_restored_updater_continues_identically(variant):
     assert torch.equal(restored.cost_limit, limit)
 
 
+def test_the_state_of_another_optimizer_changes_nothing(adam):
+    """Its next step would fail."""
+    before = snapshot(adam)
+    other = DualAscent(make_module(1.0, 1.0), cost_limit=9.0, lr=0.3, max_multiplier=5.0)
+    with pytest.raises(ValueError, match=r"another optimizer than Adam: it has the options .*mom"):
+        adam.load_state_dict(other.state_dict())
+    assert_unchanged(adam, before)
+
+
 def test_the_state_holds_its_own_limit():
     updater = DualAscent(make_module(0.0), cost_limit=1.0, lr=0.1)
     state = updater.state_dict()

@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from torchrl.modules import ValueOperator, recurrent_mode
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives import DualAscent, PIDControl, TrustRegionLoss, ViolationUpdater
-from torchrl_safe.testing import make_batch, make_critic, make_networks
+from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
 
 OPTIONS = {
     "default": {},
@@ -112,6 +113,21 @@ def test_the_critics_alone_have_the_losses_of_the_whole(options):
         assert torch.equal(value, other)
     with pytest.raises(KeyError, match="cost_value_target"):
         loss.critic_losses(data.exclude("cost_value_target"))
+
+
+def test_recurrent_critics_see_whole_sequences_alone_too():
+    """As they do in a call of the loss, around which TorchRL says so."""
+    modes = []
+
+    class Critic(torch.nn.Linear):
+        def forward(self, observation):
+            modes.append(recurrent_mode())
+            return super().forward(observation)
+
+    actor, critic, _ = make_networks()
+    cost_critic = ValueOperator(Critic(OBSERVATION_SIZE, 1), out_keys=["cost_value"])
+    TrustRegionLoss(actor, critic, cost_critic).critic_losses(estimated())
+    assert modes == [True]
 
 
 def test_without_a_reward_critic_the_cost_critic_learns_alone():

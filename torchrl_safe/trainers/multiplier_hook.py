@@ -167,6 +167,11 @@ class MultiplierHook(TrainerHookBase):
                 "async_collection must be False: the trainer then sees no collected batch, and "
                 "the multiplier would never move."
             )
+        if getattr(trainer.collector, "set_truncated", False):
+            raise ValueError(
+                "set_truncated of the collector must be False: it cuts episodes at the end of a "
+                "batch, so that they would count with a part of their cost."
+            )
         if trainer.learner_backend != "local":
             raise ValueError(
                 f"learner_backend must be 'local', got {trainer.learner_backend!r}: the loss of "

@@ -114,8 +114,8 @@ class CostCritic(CostValues):
         unless the loss has an ``advantage_norm``, which scales it instead (as TorchRL asks, update
         it yourself, once for each batch). The cost advantages are centred and, with
         ``normalize_cost_advantage``, divided by a scale that the loss keeps from call to call.
-        Steps that the loss leaves out, such as those that pad a trajectory
-        (``("collector", "mask")``), do not count. A trajectory ends where its padding begins.
+        Steps that the loss leaves out do not count. Those that pad a trajectory, by
+        ``("collector", "mask")``, also end it.
 
         If you call the loss with a batch that has no advantages, it does the same first.
 

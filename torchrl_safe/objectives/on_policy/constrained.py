@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Mapping
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -160,6 +162,7 @@ class ConstrainedPPO(ConstrainedLoss):
         cost_critic_coeff: float = 1.0,
         **kwargs: Any,
     ) -> None:
+        self._check_arguments(kwargs)
         super().__init__(
             actor_network,
             critic_network,
@@ -169,6 +172,13 @@ class ConstrainedPPO(ConstrainedLoss):
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
+
+    @classmethod
+    def _check_arguments(cls, kwargs: Mapping[str, Any]) -> None:
+        """Refuses what no constructor takes: TorchRL's would ignore it."""
+        known = {name for base in cls.__mro__ for name in signature(base.__init__).parameters}
+        if unknown := sorted(kwargs.keys() - known):
+            raise TypeError(f"{cls.__name__} got unexpected arguments: {', '.join(unknown)}.")
 
     def evaluate(self, tensordict: TensorDictBase) -> Policy:
         """The present policy. What its modules write stays in the data, where heads find it."""

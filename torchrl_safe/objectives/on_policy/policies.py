@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CompositeDistribution, set_composite_lp_aggregate
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Categorical, Distribution, kl_divergence
+from torch.distributions import Categorical, Distribution, Independent, kl_divergence
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives.critics.cost_values import get_or_raise
@@ -54,7 +54,7 @@ class ActorCopy:
         with self._copies.to_module(self._actor, **self._options):
             try:
                 return self._actor.get_dist(tensordict.clone(False))
-            except RuntimeError as error:
+            except (RuntimeError, ValueError) as error:  # A GRU raises the second.
                 if any(original.dtype != self.dtype for original in self._originals):
                     raise RuntimeError(
                         f"The actor failed on parameters and inputs in {self.dtype}: {error} If "
@@ -120,6 +120,9 @@ def divergence(old: Distribution, new: Distribution) -> Tensor:
     if isinstance(old, CompositeDistribution) and isinstance(new, CompositeDistribution):
         parts = [divergence(part, new.dists[name]) for name, part in old.dists.items()]
         return torch.stack(parts).sum(0)
+    if isinstance(old, Independent) and isinstance(new, Independent):
+        inner, summed = divergence(old.base_dist, new.base_dist), old.reinterpreted_batch_ndims
+        return inner.sum(tuple(range(-summed, 0))) if summed else inner
     if isinstance(old, Categorical) and isinstance(new, Categorical):
         # PyTorch's has a gradient of NaN where a mask excludes an action from both.
         gap = torch.where(new.probs > 0, old.logits - new.logits, math.inf)

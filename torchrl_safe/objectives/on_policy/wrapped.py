@@ -143,7 +143,10 @@ class WrappedLoss(LossModule):
         return self._both_keys
 
     def set_keys(self, **kwargs: Any) -> None:
-        """Sets keys of the costs here, and all others in the wrapped loss."""
+        """Sets keys of the costs here, and all others in the wrapped loss.
+
+        Do not set them in the wrapped loss itself: the costs would go by the old ones.
+        """
         self.loss_module.set_keys(**{k: v for k, v in kwargs.items() if k not in _COST_KEYS})
         for name in _COST_KEYS & kwargs.keys():
             key = kwargs[name]
@@ -159,7 +162,7 @@ class WrappedLoss(LossModule):
 
 
 class _BothKeys:
-    # A view, so that it follows whoever sets a key.
+    # A view of both: the keys of the wrapped loss are in one place.
     def __init__(self, costs: CostKeys, wrapped: Any) -> None:
         self.__dict__.update(_costs=costs, _wrapped=wrapped)
 

@@ -97,7 +97,8 @@ class CostUpdater(abc.ABC):
                 then.
 
         With :class:`~torchrl.envs.RewardSum` a collector's batch gives it as
-        ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``.
+        ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``. Leave the collector's
+        ``set_truncated`` off: it would count parts of episodes.
         """
         buffer = getattr(self.loss_module, self.buffer_name)
         if not isinstance(episode_cost, Tensor):
@@ -152,6 +153,13 @@ class CostUpdater(abc.ABC):
         Raises:
             ValueError: if the state is of another kind of updater or another number of costs.
         """
+        self._check_state(state_dict)
+        # Not by a subclass: its options are still those from before the state.
+        self._cost_limit = CostUpdater._as_limit(self, state_dict["cost_limit"])
+        self.pessimism = state_dict["pessimism"]
+
+    def _check_state(self, state_dict: dict[str, Any]) -> None:
+        """Raises before anything of the state is loaded."""
         if state_dict.keys() != (own := self.state_dict().keys()):
             raise ValueError(
                 f"The state of a {type(self).__name__} has {sorted(own)}, got {sorted(state_dict)}."
@@ -161,9 +169,6 @@ class CostUpdater(abc.ABC):
                 f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "
                 f"{len(self.cost_limit)}."
             )
-        # Not by a subclass: its options are still those from before the state.
-        self._cost_limit = CostUpdater._as_limit(self, state_dict["cost_limit"])
-        self.pessimism = state_dict["pessimism"]
 
 
 def check_names(cost_names: Sequence[str] | None, num_costs: int) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe.objectives._reduction import reduced
@@ -131,10 +132,11 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
             KeyError: if a value target is missing.
         """
         tensordict = tensordict.clone(False)
-        tensordict.update(self.actor_features(tensordict))
-        losses = {"loss_cost_critic": self.loss_cost_critic(tensordict)[0]}
-        if self.critic_coeff is not None:
-            losses["loss_critic"] = self.loss_critic(tensordict)[0]
+        with set_recurrent_mode(True):  # As TorchRL has it around a loss.
+            tensordict.update(self.actor_features(tensordict))
+            losses = {"loss_cost_critic": self.loss_cost_critic(tensordict)[0]}
+            if self.critic_coeff is not None:
+                losses["loss_critic"] = self.loss_critic(tensordict)[0]
         return TensorDict(
             {name: reduced(self, loss, tensordict).squeeze(-1) for name, loss in losses.items()}
         )
