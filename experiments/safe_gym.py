@@ -266,6 +266,9 @@ def make_agent(env: EnvBase, log_std: float) -> Agent:
     )
     bounds = {}
     if isinstance(action, Bounded):
+        finite = torch.stack([action.space.low, action.space.high]).isfinite()
+        if not finite.all():
+            raise ValueError(f"env must bound its actions on both sides or on none, got {action}.")
         bounds = {"low": action.space.low, "high": action.space.high}
     actor = ProbabilisticActor(
         TensorDictModule(policy, ["observation"], ["loc", "scale"]),

@@ -522,6 +522,12 @@ def test_numpy_integers_are_integers(make_env):
     assert env.control_rate == 40
 
 
+def test_a_reset_takes_no_seed(make_env):
+    """It would be the same as none."""
+    with pytest.raises(TypeError, match="reset takes no seed: call set_seed"):
+        make_env(ArmEnv).reset(seed=3)
+
+
 def test_a_step_before_the_first_reset_is_refused(make_env):
     env = make_env(ArmEnv, num_envs=2)
     action = TensorDict(action=torch.zeros(2, 3), batch_size=[2])

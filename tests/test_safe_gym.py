@@ -219,6 +219,12 @@ def test_costs_of_skipped_frames_add_up(make_env):
     assert rollout["next", "cost"].flatten().tolist() == [0.25 + 0.5, 0.75 + 1, 1.25]
 
 
+def test_frames_of_several_environments_are_not_skipped_together():
+    """When one ends, the others would lose their frames."""
+    with pytest.raises(ValueError, match=r"frame_skip must be 1 for several environments, .* 4"):
+        SafeGymEnv("counting:Counting-v0", num_envs=2, asynchronous=False, frame_skip=4)
+
+
 @pytest.mark.parametrize("num_envs", [0, 2])
 def test_a_class_without_a_constructor(make_env, forked_workers, num_envs):
     """Python's error for it does not name the argument that TorchRL tries."""

@@ -6,10 +6,22 @@ import numpy as np
 import pybullet_data
 import pytest
 from bullet_worlds import make_world
+from worlds import step
 
-from torchrl_safe.envs import PANDA, ArmModel, Gripper, Placement
+from torchrl_safe.envs import (
+    PANDA,
+    ArmEnv,
+    ArmModel,
+    Gripper,
+    JointDelta,
+    NoObstacles,
+    Placement,
+    Reach,
+    Region,
+)
 from torchrl_safe.envs.arms.urdf import find_urdf, prepare_urdf
 from torchrl_safe.envs.gym import ARMS
+from torchrl_safe.envs.physics.mujoco.meshes import read_meshes
 
 
 def arm(path, ee_link, gripper=None):
@@ -265,3 +277,96 @@ def test_merged_arms_move_as_they_did(name, urdf_inertia, tolerance):
 
 def no_obstacles():
     return Placement(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0, dtype=bool))
+
+
+def link(name, shape="<sphere radius='0.03'/>"):
+    return (
+        f'<link name="{name}"><inertial><mass value="0.5"/>'
+        '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+        f"<collision><geometry>{shape}</geometry></collision></link>"
+    )
+
+
+def joint(number, *parts, kind="revolute", axis="0 1 0", limit='lower="-3" upper="3"'):
+    return (
+        f'<joint name="j{number}" type="{kind}"><parent link="l{number - 1}"/>'
+        f'<child link="l{number}"/><origin xyz="0 0 0.2"/><axis xyz="{axis}"/>'
+        f'<limit {limit} effort="50" velocity="2"/>{"".join(parts)}</joint>'
+    )
+
+
+@pytest.fixture
+def make_chain(make_env, tmp_path):
+    """An arm of three joints, the second of which is given."""
+
+    def make(second, shape="<sphere radius='0.03'/>"):
+        links = [link("l0"), link("l1"), link("l2", shape), link("l3")]
+        ends = joint(1, axis="0 0 1"), joint(3)
+        urdf = make_urdf(tmp_path / "chain.urdf", *links, second, *ends)
+        model = ArmModel(urdf, "l3", home=(0.1, 0.4, 0.8))
+        # Where the tool is at home.
+        task = Reach(Region((0.077, 0.007, 0.584), (0.078, 0.008, 0.585)))
+        return make_env(
+            ArmEnv, model, task=task, action=JointDelta(), obstacles=NoObstacles(), seed=0
+        )
+
+    return make
+
+
+@pytest.mark.usefixtures("engine")
+@pytest.mark.parametrize(
+    ("second", "limits"),
+    [
+        (joint(2, axis="0 2 0"), (-3.0, 3.0)),
+        (joint(2, limit='lower="0" upper="0"'), (-np.inf, np.inf)),
+        (joint(2, kind="continuous", limit='lower="-1" upper="1"'), (-np.inf, np.inf)),
+    ],
+    ids=["long-axis", "no-range", "continuous-with-range"],
+)
+def test_both_engines_read_joints_alike(make_chain, second, limits):
+    """And each joint goes where it is sent."""
+    env = make_chain(second)
+    env.reset()
+    before = env.arm_state.joint_position.copy()
+    for _ in range(10):
+        step(env, [0.0, -0.5, 0.0])
+    state = env.arm_state
+    assert (state.joint_lower[1], state.joint_upper[1]) == limits
+    turned = state.joint_position - before
+    np.testing.assert_allclose(turned, [[0, -10 * 0.5 * env.action_mode.step, 0]], atol=0.02)
+
+
+@pytest.mark.usefixtures("engine")
+def test_joints_that_cannot_be_driven_are_refused(make_chain):
+    with pytest.raises(ValueError, match=r"move each joint up to 'l3' by itself, .*joint: 'j2'"):
+        make_chain(joint(2, '<mimic joint="j1"/>'))
+    with pytest.raises(ValueError, match="axis of joint 'j2' must not be zero"):
+        make_chain(joint(2, axis="0 0 0"))
+
+
+@pytest.mark.usefixtures("engine")
+def test_a_shape_that_an_engine_cannot_read_is_no_hole(make_chain, tmp_path):
+    """Bullet would only warn, and obstacles would pass through the link."""
+    (tmp_path / "shape.stl").write_text("solid s\nendsolid s\n")
+    with pytest.raises(ValueError, match=r"urdf '.*chain.urdf' does not load in "):
+        make_chain(joint(2), shape="<mesh filename='shape.stl'/>")
+
+
+def test_a_mesh_without_faces_is_refused(tmp_path):
+    (tmp_path / "shape.obj").write_text("# no faces\nv 0 0 0\n")
+    root = ElementTree.fromstring(
+        "<robot><link><collision><geometry>"
+        f"<mesh filename='{tmp_path}/shape.obj'/></geometry></collision></link></robot>"
+    )
+    with pytest.raises(ValueError, match=r"shape.obj' must have faces, got none"):
+        read_meshes(root)
+
+
+@pytest.mark.usefixtures("engine")
+def test_meshes_are_read_as_others_write_them(make_chain, tmp_path):
+    """By a URL, with tabs, and with a comment in another encoding."""
+    corners = ["0 0 0", "0.05 0 0", "0 0.05 0", "0 0 0.05"]
+    lines = [f"v\t{corner}" for corner in corners] + ["f 1 3 2", "f 1 2 4", "f 2 3 4", "f 1 4 3"]
+    (tmp_path / "s.obj").write_bytes(b"# Gr\xfc\xdfe\n" + "\n".join(lines).encode())
+    env = make_chain(joint(2), shape=f"<mesh filename='file://{tmp_path}/s.obj'/>")
+    assert env.rollout(2)["next", "observation"].isfinite().all()

@@ -276,6 +276,10 @@ class ArmEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self._check_open()
+        if kwargs:
+            raise TypeError(
+                f"reset takes no {', '.join(kwargs)}: call set_seed, or pass a tensordict."
+            )
         chosen = None if tensordict is None else tensordict.get("_reset", None)
         rows = range(self.num_envs) if chosen is None else chosen.flatten().nonzero().flatten()
         for row in rows:

@@ -79,7 +79,7 @@ class ContactForce:
 
     Args:
         limit: N. The default is the quasi-static limit for hands and fingers of ISO/TS
-            15066:2016, table A.2.
+            15066:2016, table A.2. (The standard allows more for less than half a second.)
 
     Raises:
         ValueError: if ``limit`` is negative or not finite.

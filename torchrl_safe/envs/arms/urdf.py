@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import NamedTuple
 from torchrl_safe.envs.arms.models import ArmModel, Gripper
 from torchrl_safe.envs.arms.urdf_merge import merge_fixed_links
 
-_PACKAGE = "package://"
+_PACKAGE, _FILE = "package://", "file://"
 # What the names of an attached gripper begin with, so that they are not those of the arm.
 _PREFIX = "gripper/"
 _DATA, _MORE_ARMS = "pybullet_data", "example-robot-data"
@@ -40,7 +41,8 @@ def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool, merge: bool
         merge: make one link of those that fixed joints hold together, except the tool's frame.
 
     Raises:
-        ValueError: if a file is missing or not XML, a mesh is missing or there is no such link.
+        ValueError: if a file is missing or not XML, a mesh is missing, there is no such link, or
+            a joint that moves the tool mimics another.
     """
     root = _read(arm.urdf, visuals=visuals)
     tool_link = arm.ee_link
@@ -48,6 +50,12 @@ def prepare_urdf(arm: ArmModel, *, visuals: bool, fix_fingers: bool, merge: bool
     if arm.gripper is not None:
         tool_link = _attach(root, arm.ee_link, arm.gripper, visuals=visuals)
     chain = movable_chain(root, tool_link)
+    for joint in root.findall("joint"):
+        if joint.get("name") in chain and joint.find("mimic") is not None:
+            raise ValueError(
+                f"urdf {arm.urdf!r} must move each joint up to {tool_link!r} by itself, got a "
+                f"mimic joint: {joint.get('name')!r}."
+            )
     if fix_fingers:
         for joint in root.findall("joint"):
             if joint.get("name") not in chain:
@@ -120,9 +128,31 @@ def _read(name: str, *, visuals: bool) -> ElementTree.Element:
             for visual in link.findall("visual"):
                 link.remove(visual)
     _weigh_frames(root)
+    for joint in root.findall("joint"):
+        if joint.get("type") != "fixed":
+            _settle(joint)
     for mesh in root.iter("mesh"):
         mesh.set("filename", str(_find_mesh(path, mesh.get("filename", ""))))
     return root
+
+
+def _settle(joint: ElementTree.Element) -> None:
+    """Settles what engines read differently: lengths of axes, and ranges of joints that turn."""
+    if (axis := joint.find("axis")) is not None:
+        values = [float(value) for value in axis.get("xyz", "1 0 0").split()]
+        length = math.hypot(*values)
+        if length == 0:
+            raise ValueError(f"axis of joint {joint.get('name')!r} must not be zero.")
+        if length != 1:
+            axis.set("xyz", " ".join(str(value / length) for value in values))
+    limit = joint.find("limit")
+    if limit is None or joint.get("type") not in ("revolute", "continuous"):
+        return
+    if float(limit.get("lower", 0)) >= float(limit.get("upper", 0)):
+        joint.set("type", "continuous")
+    if joint.get("type") == "continuous":
+        for name in ("lower", "upper"):
+            limit.attrib.pop(name, None)
 
 
 def _weigh_frames(root: ElementTree.Element) -> None:
@@ -174,7 +204,7 @@ def _end(joint: ElementTree.Element, side: str) -> str:
 
 
 def _find_mesh(urdf: Path, name: str) -> Path:
-    relative = name.removeprefix(_PACKAGE)
+    relative = name.removeprefix(_PACKAGE).removeprefix(_FILE)
     # ROS names a mesh by its package, whose folder is some parent of the URDF's.
     for folder in [urdf.parent, *urdf.parent.parents]:
         if (folder / relative).is_file():

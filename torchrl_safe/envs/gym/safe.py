@@ -70,6 +70,11 @@ class _CostBesideReward(GymWrapper):
         # Which environments have reset themselves in the last step, and all their observations.
         self._started: tuple[NDArray[np.bool_], Any] | None = None
         self._vectorized = self._is_batched
+        if self._vectorized and self.wrapper_frame_skip > 1:
+            raise ValueError(
+                "frame_skip must be 1 for several environments, whose episodes end at different "
+                f"frames, got {self.wrapper_frame_skip}: append FrameSkip to the environment."
+            )
         self._resets_itself = self._vectorized and autoreset.resets_itself(self._env)
 
     def read_reward(self, reward: Any) -> Tensor:

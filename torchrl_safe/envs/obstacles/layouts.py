@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +96,7 @@ class Placement:
         )
 
 
-def _check_unit(name: str, orientation: Array) -> None:
+def _check_unit(name: str, orientation: NDArray[Any]) -> None:
     wrong = np.abs(np.linalg.norm(orientation, axis=-1) - 1) > 1e-3
     if wrong.any():
         raise ValueError(f"{name} must be unit quaternions (x, y, z, w), got {orientation[wrong]}.")

@@ -176,7 +176,10 @@ class ConstrainedPPO(ConstrainedLoss):
     @classmethod
     def _check_arguments(cls, kwargs: Mapping[str, Any]) -> None:
         """Refuses what no constructor takes: TorchRL's would ignore it."""
-        known = {name for base in cls.__mro__ for name in signature(base.__init__).parameters}
+        constructors = [
+            base.__dict__["__init__"] for base in cls.__mro__ if "__init__" in vars(base)
+        ]
+        known = {name for each in constructors for name in signature(each).parameters}
         if unknown := sorted(kwargs.keys() - known):
             raise TypeError(f"{cls.__name__} got unexpected arguments: {', '.join(unknown)}.")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,6 +94,7 @@ def load_arm(
             )
         except pybullet.error as error:
             raise ValueError(f"urdf {arm.urdf!r} does not load in PyBullet.") from error
+    _check_shapes(client, body, text, arm.urdf)
     loaded = _find_joints(client, body, chain, tool_link)
     if len(arm.home) != len(loaded.joints):
         raise ValueError(
@@ -107,6 +109,23 @@ def load_arm(
     if scene.motor_limits:
         _couple(client, body, loaded.fingers)
     return loaded
+
+
+def _check_shapes(client: int, body: int, text: str, urdf: str) -> None:
+    """Raises unless all collision shapes were loaded: Bullet leaves out meshes it cannot read."""
+    numbers = {pybullet.getBodyInfo(body, physicsClientId=client)[0].decode(): -1}
+    for number in range(pybullet.getNumJoints(body, physicsClientId=client)):
+        info = pybullet.getJointInfo(body, number, physicsClientId=client)
+        numbers[info[12].decode()] = number
+    for link in ElementTree.fromstring(text).iter("link"):
+        shapes, name = link.findall("collision"), link.get("name", "")
+        loaded = pybullet.getCollisionShapeData(body, numbers[name], physicsClientId=client)
+        if len(loaded) < len(shapes):
+            meshes = [mesh.get("filename") for mesh in link.iter("mesh")]
+            raise ValueError(
+                f"urdf {urdf!r} does not load in PyBullet: it cannot read a collision shape of "
+                f"{name!r}, one of {meshes}."
+            )
 
 
 def _couple(client: int, body: int, fingers: Sequence[int]) -> None:

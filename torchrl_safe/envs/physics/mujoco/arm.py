@@ -92,7 +92,7 @@ def read_arm(
 
 def name_solids(spec: Any) -> dict[str, str]:
     """Names the shapes of an arm that collide; returns each with the name of its body."""
-    solids = {}
+    solids: dict[str, str] = {}
     for body in spec.bodies[1:]:
         for geom in body.geoms:
             # Shapes that are only drawn have neither.

@@ -22,7 +22,7 @@ def read_meshes(root: Element) -> dict[str, bytes]:
         root: a URDF with the paths of its meshes; changed in place.
 
     Raises:
-        ValueError: if a shape that collides is a COLLADA file.
+        ValueError: if a shape that collides is a COLLADA file, or has no faces.
     """
     files: dict[str, bytes] = {}
     for link in root.iter("link"):
@@ -38,7 +38,10 @@ def read_meshes(root: Element) -> dict[str, bytes]:
                     link.remove(shape)
                 elif file.suffix.lower() == ".obj":
                     link.remove(shape)
-                    for text in _objects(file.read_text()):
+                    objects = _objects(file.read_text(errors="replace"))
+                    if kind == "collision" and not objects:
+                        raise ValueError(f"{str(file)!r} must have faces, got none.")
+                    for text in objects:
                         name = f"mesh-{len(files)}.obj"
                         files[name] = text
                         mesh.set("filename", name)
@@ -55,14 +58,14 @@ def _objects(text: str) -> list[bytes]:
     corners: list[str] = []
     objects: list[list[list[int]]] = [[]]
     for line in text.splitlines():
-        kind, _, rest = line.partition(" ")
+        kind, *rest = line.split() or [""]
         if kind == "v":
-            corners.append(line)
+            corners.append(" ".join([kind, *rest]))
         elif kind in _OBJECT:
             objects.append([])
         elif kind == "f":
             # A corner can be corner/texture/normal, and count from the last.
-            numbers = [int(corner.partition("/")[0]) for corner in rest.split()]
+            numbers = [int(corner.partition("/")[0]) for corner in rest]
             objects[-1].append([n - 1 if n > 0 else len(corners) + n for n in numbers])
     return [_write(corners, faces) for faces in objects if faces]
 

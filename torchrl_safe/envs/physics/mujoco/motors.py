@@ -69,7 +69,8 @@ def add_rotors(spec: Any, parts: ArmParts, mass: Array) -> Array:
     Returns:
         The diagonal with what was added.
     """
-    run_up = np.divide(parts.effort, parts.speed) * _RUN_UP
+    with np.errstate(invalid="ignore"):  # Infinite both.
+        run_up = np.divide(parts.effort, parts.speed) * _RUN_UP
     rotors = np.maximum(_ROTORS * mass, np.where(np.isfinite(run_up), run_up, 0) - mass)
     efforts = parts.effort[len(parts.joints) :]
     # Fingers are as heavy as makes them as stiff as that.
