@@ -100,12 +100,13 @@ for batch in Collector(
 ):
     updater.step(batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)])
     buffer.extend(loss.estimate_advantages(batch).reshape(-1))
-    for minibatch in (sample for _ in range(10) for sample in buffer):
-        losses = loss(minibatch)
-        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-        nn.utils.clip_grad_norm_(actor.parameters(), 0.5)
-        optimizer.step()
-        optimizer.zero_grad()
+    for _ in range(10):  # passes over the batch
+        for minibatch in buffer:
+            losses = loss(minibatch)
+            sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+            nn.utils.clip_grad_norm_(actor.parameters(), 0.5)
+            optimizer.step()
+            optimizer.zero_grad()
 
 # %%
 # One file

@@ -13,8 +13,7 @@ Come here when you want to put limits into a loop that you already have. It take
 # 1. An environment with a cost
 # -----------------------------
 #
-# ``ArmEnv`` is batched: 32 arms, each in a world of its own. Here an action turns each of the
-# seven joints by up to 0.1 rad.
+# ``ArmEnv`` simulates 32 arms side by side. An action moves the tool by up to 5 cm along x, y, z.
 
 import matplotlib.pyplot as plt
 import torch
@@ -161,7 +160,7 @@ print(
 
 # %%
 # **Then the advantages**, of reward and cost, over the whole batch and before it is cut into
-# minibatches. Both have the same size now, so a multiplier of 1 weighs both alike:
+# minibatches. Both have the same size at first, and a multiplier of 1 then weighs both alike:
 
 batch = loss.estimate_advantages(batch)
 for key in ("advantage", "cost_advantage", "value_target", "cost_value_target"):
@@ -198,12 +197,13 @@ for batch in batches:
     episodes = batch["next"][batch["next", "done"].squeeze(-1)]
     updater.step(episodes["episode_cost"])
     buffer.extend(loss.estimate_advantages(batch).reshape(-1))
-    for minibatch in (sample for _ in range(10) for sample in buffer):
-        losses = loss(minibatch)
-        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-        nn.utils.clip_grad_norm_(actor.parameters(), 0.5, error_if_nonfinite=True)
-        optimizer.step()
-        optimizer.zero_grad()
+    for _ in range(10):  # passes over the batch
+        for minibatch in buffer:
+            losses = loss(minibatch)
+            sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+            nn.utils.clip_grad_norm_(actor.parameters(), 0.5, error_if_nonfinite=True)
+            optimizer.step()
+            optimizer.zero_grad()
     schedule.step()
     success = episodes["success"].float().mean().item()
     cost, multiplier = episodes["episode_cost"].mean().item(), loss.lagrange_multiplier.item()
