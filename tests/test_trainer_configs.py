@@ -92,7 +92,7 @@ def test_the_arguments_of_the_trainer():
     node = OmegaConf.structured(ConstrainedPPOTrainerConfig)
     for name in ("frame_skip", "optim_steps_per_batch", "gamma", "lmbda", "add_gae", "gae"):
         assert node[name] == ours[name].default
-    for name in ("done_key", "episode_cost_key", "cost_names"):
+    for name in ("done_key", "episode_cost_key"):
         assert node[name] == ours[name].default
     assert OmegaConf.is_missing(node, "updater")
 
@@ -107,7 +107,7 @@ def test_the_documented_configuration(example):
     assert next(collector.policy.parameters()) is next(loss.actor_network.parameters())
     assert loss.value_estimator.gamma == loss.cost_value_estimator.gamma == pytest.approx(0.97)
     updater = trainer._modules["multiplier"].updater
-    assert isinstance(updater, DualAscent)
+    assert isinstance(updater, PIDControl)
     assert updater.loss_module is loss
     trainer.shutdown()
 
@@ -115,10 +115,12 @@ def test_the_documented_configuration(example):
 def test_another_rule_and_two_costs(example):
     """Lists arrive as k numbers."""
     loss = instantiate(read(example).loss, num_costs=2)
+    dual = instantiate(DualAscentConfig(cost_limit=[1.0, 2.0], lr=0.3))(loss)
+    assert isinstance(dual, DualAscent)
     config = PIDControlConfig(cost_limit=[1.0, 2.0], kp=0.5, ki=0.1, kd=0.5)
     updater = instantiate(config)(loss)
     assert isinstance(updater, PIDControl)
-    assert updater.cost_limit.tolist() == [1, 2]
+    assert dual.cost_limit.tolist() == updater.cost_limit.tolist() == [1, 2]
     updater.step(torch.tensor([[3.0, 2.0]]))
     assert loss.lagrange_multiplier.tolist() == pytest.approx([0.6, 0])  # A violation of 1 at most.
 
@@ -127,7 +129,7 @@ def test_a_loss_that_reads_violations(example):
     path = example / "crpo.yaml"
     documented = (example / "config.yaml").read_text(encoding="utf-8")
     text = documented.replace("loss: lagrangian", "loss: crpo")
-    text = text.replace("updater: dual_ascent", "updater: violation").replace("  lr: 0.2\n", "")
+    text = text.replace("updater: pid_control", "updater: violation")
     path.write_text(text, encoding="utf-8")
     with initialize_config_dir(str(example), version_base="1.3"):
         trainer = instantiate(compose("crpo").trainer)

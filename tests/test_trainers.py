@@ -59,7 +59,8 @@ class Arm:
             MLP(observations, 2, num_cells=[8]), ["observation"], ["cost_value"]
         )
         self.loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=2, entropy_bonus=False)
-        self.updater = rule(self.loss, **(settings or {"cost_limit": 2.0, "lr": 0.1}))
+        settings = settings or {"cost_limit": 2.0, "lr": 0.1}
+        self.updater = rule(self.loss, cost_names=list(self.costs), **settings)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=1e-3)
         self.buffer = make_buffer(FRAMES, FRAMES // 2)
         self.collector = make_collector(env, actor, FRAMES)
@@ -81,7 +82,7 @@ class Arm:
         )
 
     def safe_trainer(self, **settings):
-        return self.trainer(updater=self.updater, cost_names=list(self.costs), **settings)
+        return self.trainer(updater=self.updater, **settings)
 
 
 def make_actor(observations):
@@ -153,7 +154,7 @@ def test_one_batch_by_hand():
 
 def test_a_batch_in_which_no_episode_ended():
     loss = make_loss(multiplier_init=0.25)
-    hook = MultiplierHook(DualAscent(loss, cost_limit=1.0, lr=0.5), cost_names=["touch"])
+    hook = MultiplierHook(DualAscent(loss, cost_limit=1.0, lr=0.5, cost_names=["touch"]))
     batch = hook(make_episodes([[3.0], [4.0]], [False, False]))
     assert loss.lagrange_multiplier.item() == 0.25
     assert hook.log(batch) == {"log_pbar": True, "lagrange_multiplier/touch": 0.25}
@@ -161,7 +162,7 @@ def test_a_batch_in_which_no_episode_ended():
 
 def test_violations():
     loss = P3OLoss(*make_networks())
-    hook = MultiplierHook(ViolationUpdater(loss, cost_limit=1.0), cost_names=["touch"])
+    hook = MultiplierHook(ViolationUpdater(loss, cost_limit=1.0, cost_names=["touch"]))
     scalars = hook.log(hook(make_episodes([[3.0], [4.0]], [True, True])))
     assert scalars["cost_violation/touch"] == 2.5
 
@@ -193,34 +194,16 @@ def test_padded_batches():
     assert loss.lagrange_multiplier.item() == 4
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"cost_names": ["touch"]}, "cost_names must be a different name for each of the 2 costs"),
-        ({"cost_names": ["touch", "touch"]}, "cost_names must be a different name for each"),
-        ({"cost_names": "ab"}, "cost_names must be a different name for each .* got 'ab'"),
-    ],
-)
-def test_bad_names(settings, message):
-    updater = DualAscent(make_loss(num_costs=2), cost_limit=1.0, lr=0.5)
-    with pytest.raises(ValueError, match=message):
-        MultiplierHook(updater, **settings)
-
-
 def test_names_are_those_of_the_updater():
     loss, limits = make_loss(num_costs=2), {"touch": 1.0, "speed": 2.0}
     updater = DualAscent(loss, cost_limit=limits, cost_names=["touch", "speed"], lr=0.5)
-    for hook in (MultiplierHook(updater), MultiplierHook(updater, cost_names=["touch", "speed"])):
-        batch = make_episodes([[3.0, 2.0]], [True])
-        assert set(hook.log(batch)) == {
-            "log_pbar",
-            "episode_cost/touch",
-            "episode_cost/speed",
-            "lagrange_multiplier/touch",
-            "lagrange_multiplier/speed",
-        }
-    with pytest.raises(ValueError, match=r"those of the updater, \('touch', 'speed'\), or be left"):
-        MultiplierHook(updater, cost_names=["speed", "touch"])
+    assert set(MultiplierHook(updater).log(make_episodes([[3.0, 2.0]], [True]))) == {
+        "log_pbar",
+        "episode_cost/touch",
+        "episode_cost/speed",
+        "lagrange_multiplier/touch",
+        "lagrange_multiplier/speed",
+    }
 
 
 def test_no_updater():
@@ -268,7 +251,7 @@ def test_the_hook_in_a_ppo_trainer(make_arm, tmp_path):
     arm = make_arm()
     logger = CSVLogger("run", log_dir=str(tmp_path))
     trainer = arm.trainer(PPOTrainer, 3, gae=arm.loss.estimate_advantages, logger=logger)
-    MultiplierHook(arm.updater, cost_names=list(arm.costs)).register(trainer)
+    MultiplierHook(arm.updater).register(trainer)
     trainer.train()
     multipliers = read_log(tmp_path, "lagrange_multiplier/always")
     assert [step for step, _ in multipliers] == [40, 80, 120]
@@ -312,8 +295,8 @@ def test_the_hook_in_a_sac_trainer(tmp_path):
         progress_bar=False,
         episode_reward_key="episode_reward",
     )
-    updater = DualAscent(loss, cost_limit=2.0, lr=0.1)
-    MultiplierHook(updater, cost_names=["always"]).register(trainer)
+    updater = DualAscent(loss, cost_limit=2.0, lr=0.1, cost_names=["always"])
+    MultiplierHook(updater).register(trainer)
     trainer.train()
     values = [value for _, value in read_log(tmp_path, "lagrange_multiplier/always")]
     assert values == pytest.approx([0.3, 0.6])

@@ -170,7 +170,6 @@ class ConstrainedPPOTrainerConfig(PPOTrainerConfig):
     gamma: float | None = None
     lmbda: float | None = None
     episode_cost_key: Any = "episode_cost"
-    cost_names: Any = None
     _target_: str = "torchrl_safe.trainers.configs.make_constrained_ppo_trainer"
 
 
@@ -180,7 +179,6 @@ def make_constrained_ppo_trainer(
     loss_module: LossModule,
     updater: Any,
     episode_cost_key: Any = "episode_cost",
-    cost_names: Any = None,
     **settings: Any,
 ) -> ConstrainedPPOTrainer:
     """Makes a trainer of what Hydra has instantiated, as TorchRL's factories do.
@@ -190,7 +188,6 @@ def make_constrained_ppo_trainer(
         loss_module (LossModule): the loss.
         updater (callable): called with the loss.
         episode_cost_key (NestedKey or list of str): see ``ConstrainedPPOTrainer``.
-        cost_names (sequence of str, optional): see ``ConstrainedPPOTrainer``.
         **settings: the other fields of :class:`ConstrainedPPOTrainerConfig`.
     """
     if isinstance(collector, partial):
@@ -200,7 +197,6 @@ def make_constrained_ppo_trainer(
         ConstrainedPPOTrainer,
         updater=updater(loss_module),
         episode_cost_key=_normalize_hydra_key(episode_cost_key),
-        cost_names=cost_names,
     )
     return _make_onpolicy_trainer(make, collector=collector, loss_module=loss_module, **settings)
 

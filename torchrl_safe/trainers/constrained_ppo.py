@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -43,7 +43,6 @@ class ConstrainedPPOTrainer(PPOTrainer):
             ``loss_module.estimate_advantages``.
         done_key (NestedKey, optional): see ``PPOTrainer``. Defaults to ``"done"``.
         episode_cost_key (NestedKey, optional): see :class:`MultiplierHook`.
-        cost_names (sequence of str, optional): see :class:`MultiplierHook`.
         **kwargs: every other keyword argument of ``PPOTrainer``, among them ``collector``,
             ``total_frames``, ``optimizer``, ``replay_buffer``, ``logger``, ``log_interval`` and
             ``num_epochs``.
@@ -94,7 +93,6 @@ class ConstrainedPPOTrainer(PPOTrainer):
         ...         sampler=SamplerWithoutReplacement(),
         ...         batch_size=20,
         ...     ),
-        ...     cost_names=arm.cost_names,
         ...     progress_bar=False,
         ... )
         >>> trainer.train()
@@ -117,13 +115,10 @@ class ConstrainedPPOTrainer(PPOTrainer):
         gae: Callable[[TensorDictBase], TensorDictBase] | None = None,
         done_key: NestedKey = "done",
         episode_cost_key: NestedKey = "episode_cost",
-        cost_names: Sequence[str] | None = None,
         **kwargs: Any,
     ) -> None:
         _check_loss(loss_module)
-        hook = MultiplierHook(
-            updater, episode_cost_key=episode_cost_key, done_key=done_key, cost_names=cost_names
-        )
+        hook = MultiplierHook(updater, episode_cost_key=episode_cost_key, done_key=done_key)
         if (gamma is None) != (lmbda is None):
             raise ValueError(f"gamma and lmbda must be given together, got {gamma} and {lmbda}.")
         if gamma is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -10,7 +9,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_safe.objectives.rules.cost_updater import CostUpdater, check_names
+from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
 
 class MultiplierHook(TrainerHookBase):
@@ -22,23 +21,20 @@ class MultiplierHook(TrainerHookBase):
     ``RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])``.
 
     Args:
-        updater (MultiplierUpdater or ViolationUpdater): moves a buffer of the trainer's loss.
+        updater (MultiplierUpdater or ViolationUpdater): moves a buffer of the trainer's loss. Its
+            ``cost_names`` are those of the logs.
 
     Keyword Args:
         episode_cost_key (NestedKey, optional): undiscounted cost of the episode so far, read
             under ``"next"``, shape ``(*B, k)``. Defaults to ``"episode_cost"``.
         done_key (NestedKey, optional): read under ``"next"``, shape ``(*B, 1)``.
             Defaults to ``"done"``.
-        cost_names (sequence of str, optional): names of the k costs for the logs, for example
-            ``env.cost_names``. Defaults to those of the updater, which are
-            ``("0", "1", ...)`` by default.
 
     Raises:
         TypeError: if ``updater`` is no updater of :mod:`torchrl_safe.objectives`.
-        ValueError: if there is not one name for each cost, or the updater has others; in
-            :meth:`register`, if the trainer trains another loss than the updater's or gives no
-            batches to its hooks; in a call, if the shapes of cost and done do not fit, or a cost
-            is not finite.
+        ValueError: in :meth:`register`, if the trainer trains another loss than the updater's or
+            gives no batches to its hooks, or its collector cuts episodes; in a call, if the shapes
+            of cost and done do not fit, or a cost is not finite.
         KeyError: in a call, if the batch has no such key.
 
     Logged are, for each cost, ``"lagrange_multiplier/<name>"`` (after the step; for a
@@ -72,7 +68,6 @@ class MultiplierHook(TrainerHookBase):
         *,
         episode_cost_key: NestedKey = "episode_cost",
         done_key: NestedKey = "done",
-        cost_names: Sequence[str] | None = None,
     ) -> None:
         if not isinstance(updater, CostUpdater):
             raise TypeError(
@@ -82,14 +77,6 @@ class MultiplierHook(TrainerHookBase):
         self.updater = updater
         self.episode_cost_key = unravel_key(("next", episode_cost_key))
         self.done_key = unravel_key(("next", done_key))
-        self.cost_names = updater.cost_names
-        if cost_names is not None:
-            self.cost_names = check_names(cost_names, len(self._buffer))
-            if self.cost_names != updater.cost_names != check_names(None, len(self._buffer)):
-                raise ValueError(
-                    f"cost_names must be those of the updater, {updater.cost_names}, or be left "
-                    f"out, got {cost_names!r}."
-                )
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Steps the updater; the batch is returned as it is."""
@@ -112,7 +99,7 @@ class MultiplierHook(TrainerHookBase):
             **{
                 f"{title}/{name}": value
                 for title, values in scalars.items()
-                for name, value in zip(self.cost_names, values.tolist(), strict=True)
+                for name, value in zip(self.updater.cost_names, values.tolist(), strict=True)
             },
         }
 
