@@ -109,11 +109,11 @@ class Config:
     frames: int = 128_000
     """Control steps to train for, with each algorithm."""
     demonstrations: int = 0
-    """Control steps of demonstrations, before the training: a scripted pilot says what to do, and
-    the policy learns it."""
+    """Control steps that a scripted pilot demonstrates before the training; the policy imitates
+    them."""
     care: Literal["careful", "hurried"] = "careful"
-    """How carefully that pilot acts; a hurried one exceeds limits, so the policy begins with the
-    task learnt, and has to learn the limits."""
+    """How the scripted pilot demonstrates; a hurried one exceeds limits, so the policy begins with
+    the task learnt, and has to learn the limits."""
     envs: int = 32
     """Simulated worlds, shared among the workers."""
     workers: int | None = None

@@ -101,7 +101,8 @@ def summarize(
         Estimate, lower and upper end, by name of the figure.
 
     Raises:
-        ValueError: if there is not one name for each cost.
+        ValueError: if there is not one name for each cost, or fewer than two episodes, which have
+            no interval.
 
     Examples:
         >>> episodes = TensorDict(

@@ -115,7 +115,8 @@ class Simulator(Protocol):
                 fingers: free ones then are not driven.
 
         Raises:
-            FloatingPointError: if the state of a world is not finite or unstable; names the row.
+            FloatingPointError: if the state of a world is not finite, or MuJoCo finds it unstable;
+                names the row.
         """
 
     def state(self) -> ArmState:
