@@ -6,27 +6,30 @@ from functools import partial
 
 import pytest
 import torch
+from first_order import (
+    FAR,
+    actor_gradient,
+    build,
+    crpo,
+    old_policy,
+    policy,
+    step,
+    total,
+    train,
+)
 from on_policy import estimated, make_loss
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from tensordict.utils import unravel_key
 from torch.distributions import Categorical, Independent, kl_divergence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
-from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, PPOLoss, SoftUpdate
-from torchrl.objectives.value import TD0Estimator
+from torchrl.objectives import ClipPPOLoss, PPOLoss, SoftUpdate
 
 from torchrl_safe.objectives import (
-    CRPOLoss,
     CUPLoss,
-    DualAscent,
     FOCOPSLoss,
     IPOLoss,
     P3OLoss,
-    PIDControl,
-    PPOLagrangianLoss,
-    TrustRegionLoss,
-    ViolationUpdater,
     penalized_advantage,
 )
 from torchrl_safe.objectives.on_policy.crpo import rectified_advantage
@@ -35,64 +38,7 @@ from torchrl_safe.objectives.on_policy.ipo import log_barrier
 from torchrl_safe.objectives.on_policy.p3o import exact_penalty
 from torchrl_safe.objectives.on_policy.policies import divergence
 from torchrl_safe.objectives.on_policy.surrogate import clipped_cost_surrogate
-from torchrl_safe.testing import make_actor, make_batch, make_critic, make_networks
-
-
-def crpo(actor, critic, cost_critic, *, num_costs=1, tolerance=0.0, **kwargs):
-    parent = ClipPPOLoss(actor, critic, **kwargs)
-    return CRPOLoss(parent, cost_critic, num_costs=num_costs, tolerance=tolerance)
-
-
-# The batch is of another policy, far outside the trust region of FOCOPS.
-near = partial(FOCOPSLoss, kl_bound=1.0)
-LOSSES = {"focops": near, "cup": CUPLoss, "p3o": P3OLoss, "ipo": IPOLoss, "crpo": crpo}
-# As far below their limits as a number can be, so that no method acts.
-FAR = -1e30
-every_loss = pytest.mark.parametrize("make", LOSSES.values(), ids=LOSSES.keys())
-
-
-def build(make, num_costs=1, seed=0, **kwargs):
-    return make(*make_networks(num_costs, seed=seed), num_costs=num_costs, **kwargs)
-
-
-def step(loss, violation):
-    """Violations or multipliers, whichever the loss reads, by the front door."""
-    violation = torch.tensor(violation)
-    if "cost_violation" in dict(loss.named_buffers()):
-        ViolationUpdater(loss, cost_limit=0.0).step(violation.unsqueeze(0))
-    else:
-        DualAscent(loss, cost_limit=0.0, lr=1.0).step(violation.unsqueeze(0))
-
-
-def total(losses):
-    return sum(value for key, value in losses.items() if key.startswith("loss_"))
-
-
-def train(loss, data, updates=20):
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
-    order = torch.Generator().manual_seed(3)
-    for _ in range(updates):
-        minibatch = data[torch.randperm(len(data), generator=order)[:8]]
-        total(loss(minibatch)).backward()
-        optimizer.step()
-        optimizer.zero_grad()
-
-
-def policy(loss, data):
-    """The distribution that the loss's actor gives, with gradients to its parameters."""
-    with loss.actor_network_params.to_module(loss.actor_network):
-        return loss.actor_network.get_dist(data.select("observation"))
-
-
-def old_policy(data):
-    actor = make_actor()
-    return actor.build_dist_from_params(data)
-
-
-def actor_gradient(loss, value):
-    parameters = list(loss.actor_network_params.values(True, True))
-    return torch.cat([g.flatten() for g in torch.autograd.grad(value, parameters)])
-
+from torchrl_safe.testing import make_batch, make_critic, make_networks
 
 # ---------------------------------------------------------------- pure functions
 
@@ -464,276 +410,6 @@ def test_far_from_its_limits_ipo_has_no_force():
     for key, value in expected.items():
         assert torch.equal(losses[key], value), key
     assert actor_gradient(loss, losses["loss_penalty"]).abs().max() < 1e-20
-
-
-# ---------------------------------------------------------------- what all of them share
-
-
-@every_loss
-def test_each_loss_trains_one_network(make):
-    loss = build(make, 2)
-    step(loss, [5.0, 1.0])
-    data = estimated(loss, 2)
-    expected = {"loss_critic": "critic", "loss_cost_critic": "cost_critic"}
-    keys = [key for key, _ in loss(data).items() if key.startswith("loss_")]
-    assert len(keys) >= 4
-    for key in keys:
-        loss.zero_grad()
-        loss(data)[key].backward()
-        reached = {
-            name.removeprefix("loss_module.").split("_network")[0]
-            for name, p in loss.named_parameters()
-            if p.grad is not None and p.grad.any()
-        }
-        assert reached == {expected.get(key, "actor")}, key
-
-
-@every_loss
-def test_the_loss_writes_nothing_into_its_input(make):
-    loss, batch = build(make, 2), make_batch(2)
-    step(loss, [5.0, 1.0])
-    before = batch.clone()
-    loss(batch)
-    assert set(batch.keys(True)) == set(before.keys(True))
-    assert (batch == before).all()
-
-
-NESTED = {
-    "advantage": ("estimates", "a"),
-    "value_target": ("estimates", "t"),
-    "value": ("estimates", "v"),
-    "cost_advantage": ("estimates", "ca"),
-    "cost_value_target": ("estimates", "ct"),
-    "cost_value": ("estimates", "cv"),
-    "reward": ("info", "reward"),
-    "cost": ("info", "cost"),
-}
-
-
-@every_loss
-def test_all_keys_can_be_nested(make):
-    networks = make_networks(2, keys=NESTED)
-    loss, expected = make(*networks, num_costs=2), build(make, 2)
-    loss.set_keys(**NESTED)
-    assert ("next", "info", "cost") in loss.in_keys
-    batch = make_batch(2)
-    for key in ("reward", "cost"):
-        batch["next"].rename_key_(key, ("info", key))
-    step(loss, [5.0, 1.0])
-    step(expected, [5.0, 1.0])
-    losses, outputs = loss(estimated_in(loss, batch)), expected(estimated(expected, 2))
-    assert set(losses.keys()) == set(outputs.keys())
-    for key, value in outputs.items():
-        assert torch.equal(losses[key], value), key
-
-
-def estimated_in(loss, batch):
-    return loss.estimate_advantages(batch).reshape(-1)
-
-
-@every_loss
-def test_call_with_keywords_equals_call_with_tensordict(make):
-    loss, batch = build(make, 2), make_batch(2)
-    step(loss, [5.0, 1.0])
-    expected = loss(batch)
-    keys = {"_".join(k) if isinstance(k, tuple) else k: k for k in map(unravel_key, loss.in_keys)}
-    outputs = loss(**{name: batch[key] for name, key in keys.items()})
-    for key, output in zip(loss.out_keys, outputs, strict=True):
-        torch.testing.assert_close(output, expected[key])
-    # TorchRL does not announce these two.
-    assert set(expected.keys()) - set(loss.out_keys) <= {"explained_variance", "kl_approx"}
-
-
-@every_loss
-@pytest.mark.parametrize("used", ["saved", "loaded"])
-def test_state_goes_between_a_fresh_and_a_used_loss(make, used):
-    saved, loaded = build(make, 2), build(make, 2, seed=5)
-    saved.make_cost_value_estimator(gamma=0.5)
-    step(saved, [5.0, 1.0])
-    batch = make_batch(2)
-    {"saved": saved, "loaded": loaded}[used](batch)
-    assert loaded.load_state_dict(saved.state_dict(), strict=True)
-    expected = saved(batch)
-    for twin in (loaded, copy.deepcopy(saved)):
-        outputs = twin(batch)
-        for key, value in expected.items():
-            assert torch.equal(outputs[key], value), key
-
-
-@every_loss
-def test_cast_to_double(make):
-    loss = build(make, 2).to(torch.float64)
-    step(loss, [5.0, 1.0])
-    batch = make_batch(2).apply(lambda x: x.double() if x.is_floating_point() else x)
-    losses = loss(estimated_in(loss, batch))
-    assert {v.dtype for k, v in losses.items() if k.startswith("loss_")} == {torch.float64}
-
-
-def test_cup_keeps_the_improved_policy_in_its_state():
-    saved, loaded = build(CUPLoss, 2), build(CUPLoss, 2, seed=5)
-    data = estimated(saved, 2)
-    train(saved, data, 3)
-    saved.start_projection()
-    train(saved, data, 3)
-    loaded.load_state_dict(saved.state_dict())
-    expected = saved.projection_loss(data)
-    assert expected["kl"] > 0
-    assert torch.equal(loaded.projection_loss(data)["kl"], expected["kl"])
-    assert not any("improved" in name for name, _ in saved.named_parameters())
-
-
-@pytest.mark.parametrize("make", [FOCOPSLoss, CUPLoss])
-@pytest.mark.parametrize(
-    "rule",
-    [
-        partial(DualAscent, lr=1.0),
-        partial(
-            PIDControl, kp=1.0, ki=1.0, kd=1.0, max_multiplier=None, pessimism=0.0, normalize=False
-        ),
-    ],
-)
-def test_every_rule_moves_the_multiplier(make, rule):
-    loss = build(make, 2, multiplier_init=0.5)
-    rule(loss, cost_limit=torch.tensor([1.0, 2.0])).step(torch.tensor([[3.0, 1.0]]))
-    assert loss.lagrange_multiplier[0] > 0.5 > loss.lagrange_multiplier[1]
-    assert loss(make_batch(2))["lagrange_multiplier_0"] == loss.lagrange_multiplier[0]
-
-
-# ---------------------------------------------------------------- compilation
-
-
-# tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
-@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
-# The calls of CUP and IPO add nothing to trace to that of PPOLagrangianLoss and of P3O.
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["focops", "cup-projection", "p3o", "crpo"])
-def test_compiles_to_one_graph_that_sees_the_costs_move(name):
-    graphs = []
-
-    def eager(graph, inputs):
-        graphs.append(graph)
-        return graph.forward
-
-    torch._dynamo.reset()
-    loss = build(LOSSES[name.removesuffix("-projection")], 2)
-    data = estimated(loss, 2)
-    train(loss, data, 2)
-    call = loss.projection_loss if name == "cup-projection" else loss
-    compiled = torch.compile(call, fullgraph=True, backend=eager)
-    step(loss, [-1.0, -1.0])
-    compiled(data)
-    step(loss, [2.0, 1.0])
-    second, expected = compiled(data), call(data)
-    assert set(second.keys()) == set(expected.keys())
-    for key, value in expected.items():
-        torch.testing.assert_close(second[key], value)
-    assert len(graphs) == 1
-
-
-# ---------------------------------------------------------------- what does not fit
-
-
-@pytest.mark.parametrize(
-    ("make", "argument", "value"),
-    [
-        (FOCOPSLoss, "temperature", 0.0),
-        (FOCOPSLoss, "kl_bound", -0.1),
-        (FOCOPSLoss, "multiplier_init", -1.0),
-        (CUPLoss, "multiplier_init", -1.0),
-        (P3OLoss, "penalty_coeff", 0.0),
-        (P3OLoss, "reduction", "none"),
-        (IPOLoss, "sharpness", float("nan")),
-        (IPOLoss, "sharpness", 1e-40),
-        (IPOLoss, "sharpness", 10**20),
-        (IPOLoss, "reduction", "sum"),
-        (crpo, "tolerance", -0.5),
-        (FOCOPSLoss, "num_costs", 0),
-        (FOCOPSLoss, "num_costs", 10**400),
-        (CUPLoss, "num_costs", 0),
-        (P3OLoss, "num_costs", 0),
-        (IPOLoss, "num_costs", 0),
-        (crpo, "num_costs", 0),
-    ],
-)
-def test_an_argument_that_cannot_be_used_is_named(make, argument, value):
-    with pytest.raises(ValueError, match=rf"{argument} must .*, got .*{value}"):
-        make(*make_networks(), **{argument: value})
-
-
-@pytest.mark.parametrize(
-    "make", [PPOLagrangianLoss, TrustRegionLoss, FOCOPSLoss, CUPLoss, P3OLoss, IPOLoss]
-)
-def test_an_argument_that_does_not_exist_is_refused(make):
-    """TorchRL's PPOLoss would ignore it, a limit too."""
-    with pytest.raises(TypeError, match=r"unexpected arguments: clip_epsilom, cost_limit"):
-        make(*make_networks(), cost_limit=25.0, clip_epsilom=0.1)
-
-
-@every_loss
-def test_a_batch_without_cost_is_refused(make):
-    loss = build(make)
-    for call in (loss, loss.estimate_advantages):
-        with pytest.raises(KeyError, match=r"\('next', 'cost'\)"):
-            call(make_batch().exclude(("next", "cost")))
-
-
-@every_loss
-def test_a_cost_critic_of_the_wrong_width_is_refused(make):
-    actor, critic, _ = make_networks()
-    loss = make(actor, critic, make_critic("cost_value", 2), num_costs=3)
-    for call in (loss, loss.estimate_advantages):
-        with pytest.raises(ValueError, match=r"\(4, 6, 3\) and \(4, 6, 2\)"):
-            call(make_batch(3))
-
-
-@every_loss
-@pytest.mark.parametrize("num_costs", [1, 2])
-def test_a_loss_of_the_wrong_width_is_refused(make, num_costs):
-    actor, critic, cost_critic = make_networks(3)
-    data = estimated(make(actor, critic, cost_critic, num_costs=3), 3)
-    loss = make(actor, critic, cost_critic, num_costs=num_costs)
-    with pytest.raises(ValueError, match=r"'cost'.* each of the . costs of num_costs"):
-        loss.estimate_advantages(make_batch(3))
-    with pytest.raises(ValueError, match=r"cost_advantage.*\(24, 3\)"):
-        (loss.projection_loss if make is CUPLoss else loss)(data)
-
-
-@pytest.mark.parametrize("make", [FOCOPSLoss, CUPLoss])
-def test_the_divergence_that_is_reported_is_that_of_the_steps_that_count(make):
-    loss = build(make)
-    data = estimated(loss)
-    if make is CUPLoss:
-        loss.start_projection()
-        train(loss, data, 3)
-    kept = torch.arange(len(data)) % 3 > 0
-    evaluate = loss.projection_loss if make is CUPLoss else loss
-    expected = evaluate(data[kept])["kl"]
-    data["collector", "mask"] = kept.unsqueeze(-1)
-    assert expected > 1e-4
-    torch.testing.assert_close(evaluate(data)["kl"], expected)
-
-
-def test_what_only_one_of_them_needs_is_named_when_missing():
-    loss = build(FOCOPSLoss)
-    with pytest.raises(KeyError, match="loc"):
-        loss(estimated(loss).exclude("loc"))
-    loss = build(CUPLoss)
-    with pytest.raises(KeyError, match="'cost_advantage'"):
-        loss.projection_loss(make_batch().reshape(-1))
-    estimator = TD0Estimator(gamma=0.9, value_network=loss.cost_critic_network)
-    with pytest.raises(ValueError, match=r"estimator must be a GAE, .* got TD0Estimator"):
-        loss.make_cost_value_estimator(estimator)
-
-
-def test_crpo_wraps_any_advantage_loss():
-    for parent in (A2CLoss, KLPENPPOLoss):
-        actor, critic, cost_critic = make_networks(2)
-        loss = CRPOLoss(parent(actor, critic), cost_critic, num_costs=2)
-        before = loss(make_batch(2))["loss_objective"]
-        step(loss, [1.0, -1.0])
-        assert not torch.equal(loss(make_batch(2))["loss_objective"], before)
-    with pytest.raises(ValueError, match="normalize_advantage=True"):
-        crpo(*make_networks(), normalize_advantage=True)
 
 
 def two_masked(logits, mask):
