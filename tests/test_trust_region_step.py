@@ -1,38 +1,43 @@
-"""TrustRegionStep on small policies: bounds, reductions, refusals, counts and state."""
-
-from dataclasses import dataclass
+"""TrustRegionStep on small policies: bounds, reductions, kinds of actors, precision and work."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import (
     CompositeDistribution,
-    NormalParamExtractor,
     TensorDictModule,
     set_composite_lp_aggregate,
 )
 from torch import nn
 from torch.distributions import Categorical, Normal, kl_divergence
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
     IndependentNormal,
-    OneHotCategorical,
     ProbabilisticActor,
-    TanhNormal,
-    TruncatedNormal,
 )
-from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, PPOLoss, SoftUpdate
+from torchrl.objectives import PPOLoss, SoftUpdate
+from trust_region import (
+    ACTORS,
+    BATCH,
+    MAX_KL,
+    METHODS,
+    Fixed,
+    act,
+    actor_state,
+    critic_state,
+    discrete_actor,
+    distribution,
+    make_data,
+    make_loss,
+    normal_actor,
+)
 
 from torchrl_safe.objectives import (
     CPO,
     PCPO,
     TRPO,
     DualAscent,
-    FOCOPSLoss,
     PIDControl,
     TrustRegionLoss,
-    TrustRegionMethod,
-    TrustRegionSolution,
     TrustRegionStep,
     ViolationUpdater,
 )
@@ -45,84 +50,6 @@ from torchrl_safe.testing import (
     make_networks,
 )
 from torchrl_safe.testing.networks import mlp
-
-MAX_KL = 0.01
-BATCH = 128
-METHODS = {
-    "trpo": TRPO(),
-    "cpo": CPO(),
-    "pcpo": PCPO(),
-    "pcpo-euclid": PCPO(kl_projection=False),
-}
-
-
-def normal_actor(distribution):
-    policy = nn.Sequential(mlp(OBSERVATION_SIZE, 2 * ACTION_SIZE), NormalParamExtractor())
-    return ProbabilisticActor(
-        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=distribution,
-        return_log_prob=True,
-    )
-
-
-def discrete_actor(distribution):
-    return ProbabilisticActor(
-        TensorDictModule(mlp(OBSERVATION_SIZE, 3), ["observation"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=distribution,
-        return_log_prob=True,
-    )
-
-
-ACTORS = {
-    "normal": lambda: normal_actor(IndependentNormal),
-    "tanh-normal": lambda: normal_actor(TanhNormal),
-    "categorical": lambda: discrete_actor(Categorical),
-    "one-hot": lambda: discrete_actor(OneHotCategorical),
-}
-
-
-def make_loss(num_costs=1, actor="normal", seed=0, **kwargs):
-    torch.manual_seed(seed)
-    networks = ACTORS[actor](), make_critic(), make_critic("cost_value", num_costs)
-    return TrustRegionLoss(*networks, num_costs=num_costs, **{"entropy_bonus": False, **kwargs})
-
-
-def act(loss, data):
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        return loss.actor_network(data)
-
-
-def make_data(loss, seed=1):
-    """A batch by the present actor; what pays, costs too."""
-    torch.manual_seed(seed)
-    observation = torch.randn(BATCH, OBSERVATION_SIZE)
-    data = act(loss, TensorDict(observation=observation, batch_size=[BATCH]))
-    action = data["action"].float().reshape(BATCH, -1)
-    slope = torch.randn(action.shape[-1], 1)
-    advantage = action @ slope + 0.3 * torch.randn(BATCH, 1)
-    data["advantage"] = (advantage - advantage.mean()) / advantage.std()
-    cost = action @ (slope + 0.5 * torch.randn(action.shape[-1], 3)) + 0.3 * torch.randn(BATCH, 3)
-    data["cost_advantage"] = (cost - cost.mean(0))[:, : getattr(loss, "num_costs", 1)]
-    data["value_target"] = torch.randn(BATCH, 1)
-    data["cost_value_target"] = torch.randn_like(data["cost_advantage"])
-    return data
-
-
-def actor_state(loss):
-    return torch.cat([p.detach().flatten() for p in loss.actor_network_params.parameters()])
-
-
-def critic_state(loss):
-    params = loss.critic_network_params, loss.cost_critic_network_params
-    return torch.cat([p.detach().flatten() for group in params for p in group.parameters()])
-
-
-def distribution(loss, data):
-    with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
-        return loss.actor_network.get_dist(data.clone())
-
 
 # ---------------------------------------------------------------- what a step keeps
 
@@ -604,255 +531,3 @@ def test_the_divergence_of_a_very_small_step_is_kept_to():
         kl = kl_divergence(old, loss.actor_network.get_dist(data.double())).mean()
     assert 0 < kl <= 1e-10
     torch.testing.assert_close(info["kl"].double(), kl, rtol=1e-5, atol=0)
-
-
-# ---------------------------------------------------------------- steps that are not taken
-
-
-@dataclass(frozen=True)
-class Fixed(TrustRegionMethod):
-    """A step against, or far beyond, all that is asked of one."""
-
-    scale: float
-    constrained = False
-
-    def __call__(self, problem):
-        return TrustRegionSolution(self.scale * problem.gradient)
-
-
-def test_a_line_search_that_fails_leaves_the_actor_bit_for_bit():
-    loss = make_loss()
-    step = TrustRegionStep(loss, Fixed(1e4), max_kl=MAX_KL, max_backtracks=2)
-    before = actor_state(loss)
-    for count in (1, 2):
-        info = step.step(make_data(loss))
-        assert torch.equal(actor_state(loss), before)
-        assert step.rejected_steps == info["rejected_steps"] == count
-        assert info["step_fraction"] == info["kl"] == 0
-
-
-def test_a_step_that_does_not_gain_what_it_promised_is_refused():
-    """All actions are good: to first order a little is gained, far away they are all gone."""
-    loss = make_loss()
-    data = make_data(loss)
-    data["advantage"].fill_(1.0)
-    step = TrustRegionStep(loss, Fixed(100.0), max_kl=1e6, max_backtracks=0)
-    before = actor_state(loss)
-    step.step(data)
-    assert step.rejected_steps == 1
-    assert torch.equal(actor_state(loss), before)
-
-
-@pytest.mark.parametrize("actor", ACTORS)
-def test_a_step_without_end_is_refused(actor):
-    loss = make_loss(actor=actor)
-    before = actor_state(loss)
-    step = TrustRegionStep(loss, Fixed(float("inf")))
-    step.step(make_data(loss))
-    assert step.rejected_steps == 1
-    assert torch.equal(actor_state(loss), before)
-
-
-class Guard(nn.Module):
-    def forward(self, logits):
-        if not logits.isfinite().all():
-            raise RuntimeError("logits are not finite")
-        return logits
-
-
-def test_an_actor_that_raises_in_the_line_search_is_left_bit_for_bit():
-    actor = discrete_actor(Categorical)
-    actor.module[0].module.append(Guard())
-    loss = PPOLoss(actor, make_critic(), entropy_bonus=False)
-    before = actor_state(loss)
-    with pytest.raises(RuntimeError, match="logits are not finite"):
-        TrustRegionStep(loss, Fixed(float("inf"))).step(make_data(loss))
-    assert torch.equal(actor_state(loss), before)
-
-
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
-def test_an_indefinite_fisher_matrix_leaves_the_actor_bit_for_bit(method):
-    loss = make_loss()
-    data = make_data(loss)
-    step = TrustRegionStep(loss, method)
-    step.damping = -1e3  # No policy has a negative bend of its own, but for rounding.
-    before = actor_state(loss)
-    info = step.step(data)
-    assert torch.equal(actor_state(loss), before)
-    assert step.indefinite_steps == info["indefinite_steps"] == 1
-    assert step.rejected_steps == 0
-
-
-@pytest.mark.parametrize("name", ["reward", "cost"])
-def test_a_gradient_that_is_not_finite_is_refused(name):
-    loss = make_loss()
-    data = make_data(loss)
-    data["advantage" if name == "reward" else "cost_advantage"][3] = float("nan")
-    before = actor_state(loss)
-    with pytest.raises(ValueError, match=r"gradient of the (reward|cost) surrogate.*nan"):
-        TrustRegionStep(loss, CPO()).step(data)
-    assert torch.equal(actor_state(loss), before)
-
-
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
-def test_without_any_advantage_nothing_moves_and_nothing_is_refused(method):
-    loss = make_loss()
-    data = make_data(loss)
-    data["advantage"].zero_()
-    data["cost_advantage"].zero_()
-    before = actor_state(loss)
-    step = TrustRegionStep(loss, method)
-    info = step.step(data)
-    assert torch.equal(actor_state(loss), before)
-    assert info["step_fraction"] == 0
-    assert set(step.state_dict().values()) == {0}
-
-
-def test_without_cost_gradient_cpo_is_trpo():
-    expected, loss = make_loss(), make_loss()
-    data = make_data(loss)
-    data["cost_advantage"].zero_()
-    loss.cost_violation.fill_(5.0)
-    TrustRegionStep(loss, CPO(), max_kl=MAX_KL).step(data)
-    TrustRegionStep(expected, max_kl=MAX_KL).step(data)
-    assert torch.equal(actor_state(loss), actor_state(expected))
-
-
-# ---------------------------------------------------------------- refusals at the door
-
-
-@pytest.mark.parametrize("key", ["advantage", "cost_advantage"])
-def test_a_missing_advantage_is_named(key):
-    loss = make_loss()
-    with pytest.raises(KeyError, match=f"'{key}'"):
-        TrustRegionStep(loss, CPO()).step(make_data(loss).exclude(key))
-
-
-@pytest.mark.parametrize("method", [CPO(), PCPO()], ids=["cpo", "pcpo"])
-def test_one_cost_and_a_cost_critic_are_asked_for(method):
-    with pytest.raises(ValueError, match=r"limits one cost.*has 3"):
-        TrustRegionStep(make_loss(3), method)
-    actor, critic, _ = make_networks()
-    with pytest.raises(ValueError, match=r"needs a TrustRegionLoss.*got PPOLoss"):
-        TrustRegionStep(PPOLoss(actor, critic), method)
-
-
-@pytest.mark.parametrize("method", [CPO(), PCPO()], ids=["cpo", "pcpo"])
-def test_multipliers_beside_a_limit_of_its_own_are_refused(method):
-    """The cost would count twice: in the mixed advantage, and in the constraint."""
-    named = rf"{type(method).__name__}.*lagrange_multiplier.*\[0\.5\]"
-    with pytest.raises(ValueError, match=named):
-        TrustRegionStep(make_loss(multiplier_init=0.5), method)
-    loss = make_loss()
-    step, data, before = TrustRegionStep(loss, method), make_data(loss), actor_state(loss)
-    DualAscent(loss, cost_limit=1.0, lr=0.25).step(torch.tensor([[3.0]]))
-    with pytest.raises(ValueError, match=named):
-        step.step(data)
-    assert torch.equal(actor_state(loss), before)
-    loss.lagrange_multiplier.zero_()
-    step.step(data)
-
-
-class OtherSurrogate(PPOLoss):
-    pass
-
-
-@pytest.mark.parametrize("loss_class", [ClipPPOLoss, KLPENPPOLoss, FOCOPSLoss, OtherSurrogate])
-def test_clipped_and_penalized_surrogates_are_refused(loss_class):
-    networks = make_networks()[: 3 if loss_class is FOCOPSLoss else 2]
-    with pytest.raises(ValueError, match=rf"loss_module.*{loss_class.__name__}"):
-        TrustRegionStep(loss_class(*networks))
-
-
-def test_other_bad_losses_are_refused():
-    with pytest.raises(ValueError, match=r"loss_module.*got Linear"):
-        TrustRegionStep(nn.Linear(1, 1))
-    with pytest.raises(ValueError, match="reduction='mean', got 'sum'"):
-        TrustRegionStep(make_loss(reduction="sum"))
-    loss = make_loss()
-    for parameter in loss.actor_network_params.parameters():
-        parameter.requires_grad_(False)
-    with pytest.raises(ValueError, match="no trainable parameter"):
-        TrustRegionStep(loss)
-
-
-def test_the_actor_may_be_lazy_until_the_first_step():
-    _, critic, cost_critic = make_networks()
-    net = nn.Sequential(nn.LazyLinear(2 * ACTION_SIZE), NormalParamExtractor())
-    actor = ProbabilisticActor(
-        TensorDictModule(net, ["observation"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
-        return_log_prob=True,
-    )
-    loss = TrustRegionLoss(actor, critic, cost_critic, functional=False, entropy_bonus=False)
-    assert TrustRegionStep(loss).loss_module is loss
-
-
-@pytest.mark.parametrize("functional", [True, False])
-@pytest.mark.parametrize("separate", [True, False])
-@pytest.mark.parametrize("kind", ["reward", "cost"])
-def test_a_critic_that_the_step_would_move_is_refused(kind, separate, functional):
-    actor, critic, cost_critic = make_networks()
-    first = next(module for module in actor.modules() if isinstance(module, nn.Linear))
-    shared = {"reward": critic, "cost": cost_critic}[kind]
-    next(
-        module for module in shared.modules() if isinstance(module, nn.Linear)
-    ).weight = first.weight
-    networks = actor, critic, cost_critic
-    loss = TrustRegionLoss(*networks, separate_losses=separate, functional=functional)
-    with pytest.raises(ValueError, match="must not share parameters with a critic"):
-        TrustRegionStep(loss)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_kl", 0.0),
-        ("max_kl", float("nan")),
-        ("max_kl", float("inf")),
-        ("max_kl", None),
-        ("damping", -0.1),
-        ("cg_iterations", 0),
-        ("shrink", 1.0),
-        ("shrink", 0.0),
-        ("max_backtracks", -1),
-        ("max_backtracks", 2.5),
-        ("episode_length", 0),
-        ("episode_length", float("inf")),
-    ],
-)
-def test_numbers_out_of_range_are_named(name, value):
-    with pytest.raises(ValueError, match=rf"{name}.*{value}"):
-        TrustRegionStep(make_loss(), **{name: value})
-
-
-def test_a_policy_without_a_divergence_in_closed_form_is_refused():
-    torch.manual_seed(0)
-    loss = PPOLoss(normal_actor(TruncatedNormal), make_critic(), entropy_bonus=False)
-    with pytest.raises(NotImplementedError, match="TruncatedNormal"):
-        TrustRegionStep(loss).step(make_data(loss))
-
-
-# ---------------------------------------------------------------- state
-
-
-def test_state_round_trip():
-    """Counts go over, and a resumed run takes the same steps."""
-    loss = make_loss()
-    loss.cost_violation.fill_(1000.0)
-    step = TrustRegionStep(loss, CPO(), max_kl=MAX_KL)
-    step.step(make_data(loss))
-    step.method = Fixed(1e6)
-    step.step(make_data(loss))
-    assert step.state_dict() == {"rejected_steps": 1, "indefinite_steps": 0, "recovery_steps": 1}
-
-    resumed_loss = make_loss(seed=5)
-    resumed_loss.load_state_dict(loss.state_dict())
-    resumed = TrustRegionStep(resumed_loss, CPO(), max_kl=MAX_KL)
-    resumed.load_state_dict(step.state_dict())
-    assert resumed.state_dict() == step.state_dict()
-    step.method = CPO()
-    data = make_data(loss, seed=3)
-    assert (step.step(data) == resumed.step(data)).all()
-    assert torch.equal(actor_state(resumed_loss), actor_state(loss))
