@@ -97,7 +97,7 @@ type: $(READY)
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) $(SAFETY) runs docs/_build docs/tutorials
+	rm -rf $(VENV) $(SAFETY) docs/_build docs/tutorials
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

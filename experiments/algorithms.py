@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.data import Composite
-from torchrl.envs import CatTensors, EnvBase, Transform
+from torchrl.envs import CatTensors, EnvBase, StepCounter, Transform
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, LossModule, ValueEstimators
 
@@ -270,6 +270,10 @@ def _with_budget(config: Config) -> list[Transform]:
     return [saute, CatTensors(["observation", "remaining_budget"], "observation", del_keys=False)]
 
 
+def _counting(config: Config) -> list[Transform]:
+    return [StepCounter()]
+
+
 def _terminating(config: Config) -> list[Transform]:
     # Worse than any episode. Otherwise ending early would pay.
     return [EarlyTermination(_budgets(config), termination_reward=-20.0)]
@@ -314,18 +318,24 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         # a multiplier that moves as much less in each.
         settings=_A2C,
     ),
-    "trpo": OnPolicy(_of_ppo(TrustRegionLoss), keep_multiplier, method=TRPO()),
-    "trpo-lagrangian": OnPolicy(_of_ppo(TrustRegionLoss), method=TRPO()),
+    "trpo": OnPolicy(
+        _of_ppo(TrustRegionLoss), keep_multiplier, method=TRPO(), training_transforms=_counting
+    ),
+    "trpo-lagrangian": OnPolicy(
+        _of_ppo(TrustRegionLoss), method=TRPO(), training_transforms=_counting
+    ),
     "cpo": OnPolicy(
         _of_ppo(TrustRegionLoss),
         partial(tell_violation, errors=2.0),
         method=CPO(),
+        training_transforms=_counting,
         settings=_TRUST_REGION,
     ),
     "pcpo": OnPolicy(
         _of_ppo(TrustRegionLoss),
         partial(tell_violation, errors=2.0),
         method=PCPO(),
+        training_transforms=_counting,
         settings=_TRUST_REGION,
     ),
     # Nothing in these losses brings the policy back. Their authors end the passes over a batch once

@@ -128,7 +128,11 @@ def cost_limits(config: Config, saved: Policy) -> tuple[float, ...]:
     """The limits that are given, or else those of the training."""
     if config.cost_limits:
         return config.cost_limits
-    if {"cost_limit", "suite_task"} & saved.settings.keys():  # Of make train.
+    settings = saved.settings
+    if "cost_keys" in settings:  # Of safe_gym: one limit may be for all.
+        limits = settings["cost_limit"]
+        return tuple(limits * len(settings["cost_keys"]) if len(limits) == 1 else limits)
+    if {"cost_limit", "suite_task"} & settings.keys():  # Of make train.
         return tuple(training_config(saved).cost_limits.values())
     return tuple(saved.settings.get("cost_limits", ()))
 

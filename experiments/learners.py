@@ -30,6 +30,7 @@ NOT_LEARNT_FROM = (
     "success",
     "episode_reward",
     "episode_cost",
+    "step_count",
     ("collector", "traj_ids"),
 )
 # What is minimized: a number for a minibatch.
@@ -101,6 +102,17 @@ class NoiseSchedule:
         self.first, self.steps = state_dict["first"], state_dict["steps"]
 
 
+def tell_length(step: TrustRegionStep, batch: TensorDictBase) -> None:
+    """Tells a trust-region step how long the episodes are that ended in a batch.
+
+    What a limit is about, an episode, is then in the unit of the surrogates. The batch needs a
+    :class:`~torchrl.envs.StepCounter`.
+    """
+    lengths = batch["next", "step_count"][batch["next", "done"]]
+    if len(lengths):
+        step.episode_length = lengths.float().mean().item()
+
+
 class OnPolicyLearner:
     """Goes through each batch some times in minibatches, then forgets it.
 
@@ -148,9 +160,7 @@ class OnPolicyLearner:
     def learn(self, batch: TensorDictBase) -> None:
         data = self.loss.estimate_advantages(batch).reshape(-1)
         if self.actor_step is not None:
-            # What a limit, of an episode, is in the unit of the step's surrogates.
-            ended = int(batch["next", "done"].sum())
-            self.actor_step.episode_length = batch.numel() / max(ended, 1)
+            tell_length(self.actor_step, batch)
             self.actor_step.step(data)
         data = data.exclude(*NOT_LEARNT_FROM)
         for prepare, objective in self.phases:

@@ -51,7 +51,7 @@ class Config:
     """Folder of results; runs that are already there are not run again."""
 
     def __post_init__(self) -> None:
-        check_grid(self, "seeds")
+        check_grid(self, "multipliers", "limits", "seeds")
 
 
 def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:

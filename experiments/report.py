@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 from PIL import Image
 from torchrl.envs import EnvBase
@@ -175,9 +176,10 @@ def plot_learning(
             x=0.01,
             ha="left",
         )
+        ends: dict[Axes, list[tuple[float, float, str, str]]] = {}
         for axes, (title, panels) in zip(grid, rows.items(), strict=True):
             for axis, (name, bounds) in zip(axes, LEARNING.items(), strict=True):
-                ends = []
+                ends[axis] = []
                 for line in panels[name]:
                     curves = np.array([running_mean(run, width) for run in line.runs])
                     frames = frames_per_point * np.arange(1, curves.shape[1] + 1)
@@ -185,17 +187,20 @@ def plot_learning(
                     low, high = (middle - spread).clip(*bounds), (middle + spread).clip(*bounds)
                     axis.plot(frames, middle, color=line.colour)
                     axis.fill_between(frames, low, high, color=line.colour, alpha=0.15, lw=0)
-                    ends.append((frames[-1], middle[-1], line.label, line.colour))
+                    ends[axis].append((frames[-1], middle[-1], line.label, line.colour))
                 axis.set_title(f"{title}: episode {name}")
                 axis.xaxis.set_major_formatter(EngFormatter(sep=""))
                 if name == "success":
                     axis.set_ylim(0, 1)
-                figure.canvas.draw()
+        # All rows share the scales of a column: limits and names come when all lines are there.
+        figure.canvas.draw()
+        for axes in grid:
+            for axis, name in zip(axes, LEARNING, strict=True):
                 for limit in limits if name == "cost" else ():
                     # Several would overlap, and their lines have names.
                     text = f"limit {limit:g}" if len(limits) == 1 else ""
                     limit_line(axis, limit, text=text, shade=limit == max(limits))
-                label_ends(axis, ends)
+                label_ends(axis, ends[axis])
         for axis in grid[-1]:
             axis.set_xlabel("control steps")
         figure.savefig(path)

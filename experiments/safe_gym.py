@@ -26,7 +26,7 @@ from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, Unbounded
-from torchrl.envs import EnvBase, RewardSum
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
@@ -34,7 +34,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
 from experiments.compiling import compiled
 from experiments.files import TO_RESUME, require_new, write_whole
-from experiments.learners import NOT_LEARNT_FROM, Objective, moved_from_here, summed
+from experiments.learners import NOT_LEARNT_FROM, Objective, moved_from_here, summed, tell_length
 from experiments.log import Log, figures, versions
 from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.envs.gym import SafeGymEnv
@@ -118,6 +118,8 @@ class Config:
         for name in (*counts, "epochs", "minibatch", "random_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.envs == self.eval_episodes == 1:
+            raise ValueError("eval_episodes must be at least 2 with one environment, got 1.")
         if not 0 <= self.seed < EVALUATION:
             raise ValueError(f"seed must be at least 0 and below {EVALUATION}, got {self.seed}.")
         for name in ("max_kl", "learning_rate", "max_grad_norm"):
@@ -252,7 +254,8 @@ def small_network(inputs: int, outputs: int, gain: float) -> MLP:
 
 def make_agent(env: EnvBase, log_std: float) -> Agent:
     """Makes the networks for an environment."""
-    observation, action = env.observation_spec_unbatched["observation"], env.action_spec_unbatched
+    observations, action = env.observation_spec_unbatched, env.action_spec_unbatched
+    observation = observations.get("observation", observations)  # Some have others.
     if observation.ndim != 1 or not isinstance(action, Bounded | Unbounded):
         raise ValueError(
             "env must have a vector for an observation and continuous actions, got "
@@ -294,7 +297,11 @@ def make_env(config: Config) -> EnvBase:
         num_envs=config.envs if config.envs > 1 else 0,
         asynchronous=config.asynchronous,
     )
-    return env.append_transform(RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
+    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
+    algorithm = ALGORITHMS[config.algorithm]
+    if isinstance(algorithm, OnPolicy) and algorithm.method is not None:
+        sums = Compose(sums, StepCounter())  # How long episodes are.
+    return env.append_transform(sums)
 
 
 def make_collector(config: Config, env: EnvBase, agent: Agent) -> Collector:
@@ -361,6 +368,7 @@ class Learner:
         data = batch.exclude(*NOT_LEARNT_FROM).reshape(-1)
         moved = moved_from_here(self.agent.actor, data)
         if self.step is not None:
+            tell_length(self.step, batch)
             self.step.step(data)
         self._descend(self.objective, data, moved)
         kl = moved()
@@ -468,12 +476,21 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     return agent, log
 
 
+def start(config: Config) -> None:
+    """Begins a run, unless its folder has one of this script that is to be resumed."""
+    path = config.out / "results.json"
+    if config.resume and path.exists() and "env" in json.loads(path.read_text())["config"]:
+        return
+    require_new(config.out, "There is no run in it to resume." if config.resume else TO_RESUME)
+    if config.resume:
+        print(f"There is no run in {config.out} to resume: this begins one.")
+    config.out.mkdir(parents=True, exist_ok=True)
+    write_whole(path, json.dumps({"config": dataclasses.asdict(config)}, default=str))
+
+
 def main(config: Config) -> dict[str, Any]:
     """Trains, evaluates, and writes the results."""
-    if not config.resume:
-        require_new(config.out, TO_RESUME)
-    elif not (config.out / "checkpoints").exists():
-        print(f"There is no run in {config.out} to resume: this begins one.")
+    start(config)
     agent, log = train(config)
     seconds = log.seconds
     env = make_env(config)

@@ -82,7 +82,8 @@ def card(config: Config, file: Path) -> dict[str, Any]:
         "seed": config.seed,
         **{name: [round(part, 4) for part in figure] for name, figure in figures.items()},
         "trained": f'make suite ARGS="--tasks {task} --algorithms {settings["name"]} '
-        f'--seeds {settings["seed"]} --physics {settings["physics"]}"',
+        f"--seeds {settings['seed']} --physics {settings['physics']} "
+        f'--frames {settings["frames"]}"',
         "frames": settings["frames"],
         "versions": versions(),
     }

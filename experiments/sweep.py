@@ -47,8 +47,8 @@ class Config:
     """What an action moves."""
     observation: Observation = "full"
     """What the policy sees."""
-    physics: Engine = "mujoco"
-    """Engine that simulates the arm; bullet takes several times as long."""
+    physics: Engine | None = None
+    """Engine that simulates the arm: by default mujoco, and bullet with the paper's environment."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the runs."""
     frames: int = TrainConfig.frames
@@ -68,6 +68,8 @@ class Config:
 
     def __post_init__(self) -> None:
         check_grid(self, "actions", "limits", "seeds")
+        if min(self.limits) <= 0:
+            raise ValueError(f"limits must be positive, got {self.limits}.")
 
 
 def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
@@ -78,7 +80,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
                 paper=config.paper,
                 action=action,
                 observation=config.observation,
-                physics=config.physics,
+                physics=config.physics or ("bullet" if config.paper else "mujoco"),
                 cost_limit=limit or 0.0,
                 seed=seed,
                 frames=config.frames,
@@ -164,7 +166,8 @@ def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
                 x = limit * 1.06 ** (place - (len(config.seeds) - 1) / 2)
                 axis.plot([x, x], [low, high], color=hue, alpha=0.5)
                 axis.plot(x, value, "o", color=hue, ms=4)
-            ppo = mean(episode_costs(_select(runs, action, None)).flatten().unsqueeze(-1))
+            costs = episode_costs(_select(runs, action, None)).unsqueeze(-1)
+            ppo = mean(costs, resample="seeds" if len(costs) > 1 else "episodes")
             axis.axhline(ppo.value.item(), color=colour("ppo"), lw=1.5)
             axis.axhspan(ppo.low.item(), ppo.high.item(), color=colour("ppo"), alpha=0.15, lw=0)
             axis.set(title=f"{action.capitalize()} actions", xlabel="cost limit")

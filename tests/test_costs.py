@@ -41,17 +41,25 @@ def test_collision(cost, distances, expected):
     np.testing.assert_array_equal(cost(make_state(contact_distance=distances)), expected)
 
 
+def test_what_is_pushed_is_touched():
+    """Bullet pushes where bodies are still a hair apart."""
+    state = make_state(contact_distance=[[1e-4], [1e-4]], contact_force=[[0.0], [288.0]])
+    np.testing.assert_array_equal(Collision()(state), [0, 1])
+
+
 def test_collision_without_obstacles_is_free():
-    np.testing.assert_array_equal(
-        Collision()(make_state(contact_distance=np.zeros((2, 0)))), [0, 0]
-    )
+    nothing = np.zeros((2, 0))
+    state = make_state(contact_distance=nothing, contact_force=nothing)
+    np.testing.assert_array_equal(Collision()(state), [0, 0])
 
 
 def test_collision_within_a_margin():
     """What is nearer in any substep counts, and so does a touch between two measurements."""
     clearance = np.array([[[0.03], [0.02]], [[0.03], [0.021]], [[np.inf], [np.inf]]])
     state = make_state(
-        contact_distance=[[np.inf], [np.inf], [-0.001]], trace={"clearance": clearance}
+        contact_distance=[[np.inf], [np.inf], [-0.001]],
+        contact_force=np.zeros((3, 1)),
+        trace={"clearance": clearance},
     )
     np.testing.assert_array_equal(Collision(margin=0.02)(state), [1, 0, 1])
 

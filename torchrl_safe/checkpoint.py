@@ -205,7 +205,13 @@ def refuse_other_settings(saved: Mapping[str, Any], settings: Mapping[str, Any])
     differences = [
         f"{name} was {saved.get(name)!r} and is now {settings.get(name)!r}"
         for name in dict.fromkeys((*settings, *saved))
-        if saved.get(name) != settings.get(name)
+        if _differs(saved.get(name), settings.get(name))
     ]
     if differences:
         raise ValueError(f"the run has other settings: {', '.join(differences)}")
+
+
+def _differs(one: Any, other: Any) -> bool:
+    """Also by the order of entries: costs, for example, are columns."""
+    both = isinstance(one, Mapping) and isinstance(other, Mapping)
+    return one != other or (both and list(one) != list(other))

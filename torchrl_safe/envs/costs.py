@@ -29,7 +29,7 @@ class Collision:
 
     Args:
         margin: distance from an obstacle that counts as a touch, m. It is measured, which takes
-            time.
+            time, and from the base of the arm too.
         table: count touches of the table too (not of what the base stands on).
         itself: count links of the arm that touch each other, unless they overlap at home. Links
             then collide; without it they pass through each other.
@@ -56,7 +56,8 @@ class Collision:
 
     def __call__(self, state: ArmState) -> Array:
         """Returns the cost of each world, shape ``(N,)``."""
-        touches = (state.contact_distance <= 0).any(axis=1)
+        # Bullet also pushes where bodies are still a hair apart.
+        touches = ((state.contact_distance <= 0) | (state.contact_force > 0)).any(axis=1)
         if self.margin:
             touches |= (state.trace["clearance"] <= self.margin).any(axis=(1, 2))
         if self.table:

@@ -116,7 +116,7 @@ class Simulator(Protocol):
 
         Raises:
             FloatingPointError: if the state of a world is not finite, or MuJoCo finds it unstable;
-                names the row.
+                names the row. The others have taken their step.
         """
 
     def state(self) -> ArmState:

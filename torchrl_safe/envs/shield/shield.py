@@ -141,8 +141,8 @@ class Shield:
         reach: distance up to which the shield measures, m. A larger one takes longer.
         acceleration: change of velocity that the motors follow, rad/s^2.
         obstacle_speed: if given, the shield expects that obstacles can come this fast at any time,
-            m/s, and stops the arm before they could touch it while it moves. ``None`` expects
-            them to keep their velocity.
+            m/s, and the arm is not the one that moves into contact. ``None`` expects them to keep
+            their velocity.
         workspace: if given, the tool point stays in this box, the margin away from its walls.
 
     Raises:

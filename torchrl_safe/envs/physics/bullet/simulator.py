@@ -112,6 +112,9 @@ class BulletSimulator:
         self._targets.add(joints, fingers)
         for row, targets in enumerate(zip(joints.tolist(), fingers.tolist(), strict=True)):
             self._advance_row(row, *targets)
+        if not (finite := np.isfinite(self._rows).all(axis=1)).all():
+            rows = ", ".join(map(str, np.flatnonzero(~finite)))
+            raise FloatingPointError(f"The physics of world {rows} is not finite: reset it.")
 
     def _advance_row(self, row: int, joints: Vector, fingers: Vector) -> None:
         world = self.worlds[row]

@@ -186,14 +186,15 @@ class MuJoCoSimulator:
                 record=self._recorded,
                 out=self._record,
             )
-        self._check()
         self._steps += 1
         self._pose = None
         if ways is not None:
             tracks.go(ways)
             self._mocap_pos[:] = tracks.now.position
             self._mocap_quat[:] = tracks.now.orientation[..., TO_MUJOCO]
-        self._read(ways)
+        with np.errstate(invalid="ignore", over="ignore"):  # Of a world that _check then names.
+            self._read(ways)
+        self._check()
 
     def _hold_absent(self) -> None:
         """Keeps obstacles that are not there from falling for ever."""
