@@ -11,6 +11,7 @@ import pytest
 import torch
 from bullet_worlds import make_world, worlds_of
 from tensordict import TensorDict
+from worlds import rest
 
 from torchrl_safe.envs import (
     PANDA,
@@ -238,3 +239,17 @@ def test_picture_world_takes_joints_and_poses():
     finally:
         one.close()
         two.close()
+
+
+def test_a_broken_world_is_named(make_env):
+    """And the others take their step."""
+    env = make_env(ArmEnv, num_envs=3, seed=0)
+    env.reset()
+    arm = worlds_of(env)[1]._arm
+    client = worlds_of(env)[1]._client
+    pybullet.resetJointState(arm.body, arm.joints[0], float("nan"), physicsClientId=client)
+    with pytest.raises(FloatingPointError, match="The physics of world 1 is not finite: reset it"):
+        rest(env)
+    env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
+    assert np.isfinite(env.arm_state.joint_position).all()
+    assert env.arm_state.step.tolist() == [1, 0, 1]

@@ -235,6 +235,8 @@ def test_what_a_killed_process_left_is_cleared_away(run, net):
 def test_settings_that_differ_are_named():
     same = {"lr": 0.1, "seed": 0, "old": 1}
     refuse_other_settings(same, dict(same))
+    with pytest.raises(ValueError, match=r"costs was {'a': 1, 'b': 2} and is now {'b': 2, 'a': 1}"):
+        refuse_other_settings({"costs": {"a": 1, "b": 2}}, {"costs": {"b": 2, "a": 1}})
     with pytest.raises(ValueError, match=r"lr was 0.1 and is now 0.2, new was None and is now 3, "):
         refuse_other_settings(same, {"lr": 0.2, "seed": 0, "new": 3})
 

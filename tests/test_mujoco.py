@@ -184,6 +184,7 @@ def test_a_broken_world_is_named(make_env, tmp_path, monkeypatch, number):
     assert not list(tmp_path.iterdir())
     # The others go on when it is reset.
     env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
+    assert env.arm_state.step.tolist() == [1, 0, 1]
     rest(env)
     assert np.isfinite(env.arm_state.joint_position).all()
 

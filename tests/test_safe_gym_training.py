@@ -3,6 +3,8 @@
 import itertools
 import json
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args, get_type_hints
 
 import numpy as np
@@ -11,7 +13,7 @@ import torch
 from torch.distributions import kl_divergence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from experiments import compiling, safe_gym, safe_gym_grid
+from experiments import compiling, evaluate, safe_gym, safe_gym_grid
 from experiments.safe_gym import Config, Critic, Standardize, main, make_agent, make_env, train
 from torchrl_safe.policy import load_policy
 
@@ -155,6 +157,21 @@ def test_resuming_where_no_run_is_says_so(tmp_path, capsys):
     assert said in capsys.readouterr().out
     main(config)
     assert said not in capsys.readouterr().out
+
+
+def test_a_run_of_another_script_is_not_overwritten(tmp_path):
+    results = tmp_path / "results.json"
+    results.write_text('{"config": {"envs": 32}, "algorithms": {}}')
+    with pytest.raises(FileExistsError, match="There is no run in it to resume"):
+        main(replace(SMALL, resume=True, out=tmp_path))
+    assert "algorithms" in results.read_text()
+
+
+@pytest.mark.parametrize(("limit", "expected"), [((3.0,), (3.0, 3.0)), ((1.0, 2.0), (1.0, 2.0))])
+def test_the_limits_of_its_policies_are_known(limit, expected):
+    """One may be for all costs."""
+    saved = SimpleNamespace(settings={"cost_keys": ["heat", "wear"], "cost_limit": [*limit]})
+    assert evaluate.cost_limits(evaluate.Config(Path("policy.pt")), saved) == expected
 
 
 def test_on_our_own_arm(tmp_path):

@@ -7,6 +7,7 @@ import json
 import math
 from typing import get_args
 
+import matplotlib.pyplot as plt
 import pytest
 import torch
 import tyro
@@ -21,7 +22,7 @@ from experiments.config import OFF_POLICY, AlgorithmName, Config, command_line
 from experiments.film import save_film
 from experiments.learners import NoiseSchedule
 from experiments.log import summed_costs
-from experiments.report import plot_curves, table
+from experiments.report import LEARNING, Line, plot_curves, plot_learning, table
 from experiments.train import collecting, main, make_env, start, train
 from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
@@ -213,7 +214,25 @@ def test_curves_with_a_shield_show_the_sum(tmp_path):
     assert widths[1] == pytest.approx(1.5 * widths[0], abs=1)
 
 
-def test_a_run_without_a_finished_episode_has_empty_curves(tmp_path):
+def test_all_rows_of_learning_curves_are_seen(tmp_path, monkeypatch):
+    """They share the scales of a column; the limit is below them all."""
+    monkeypatch.setattr(plt, "close", lambda figure: None)
+    rows = {
+        str(size): {
+            name: [Line("one", "red", [2 * [min(size, 1) if name == "success" else size]])]
+            for name in LEARNING
+        }
+        for size in (0.5, 40.0, 3.0)
+    }
+    plot_learning(rows, tmp_path / "c.png", frames_per_point=8, width=1, limits=(0.25,))
+    axes = plt.gcf().axes
+    monkeypatch.undo()
+    plt.close()
+    for axis, name in zip(axes, 3 * list(LEARNING), strict=True):
+        if name != "success":
+            low, high = axis.get_ylim()
+            assert low < 0.5 < 40 < high
+
     runs = {"ppo": {"history": [{"frames": 8, "summed/collision": 0.0}]}}
     plot_curves({"algorithms": runs, "cost_limits": {"collision": 0.5}}, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").exists()
