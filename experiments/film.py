@@ -157,7 +157,7 @@ def play(
         for part in range(1, pace.parts + 1):
             tensordict = step_mdp(env.step(tensordict.set("action", action)))
             states.append(arm.arm_state)
-            touching = bool((states[-1].contact_distance[0] <= 0).any())
+            touching = bool(states[-1].touched[0].any())
             if part == pace.parts:
                 whole = _whole(states, before)
                 reward += float(arm.task.reward(whole)[0])

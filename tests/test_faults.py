@@ -16,7 +16,7 @@ import torchrl
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.collectors import Collector, MultiSyncCollector, _multi_sync
-from torchrl.envs import ParallelEnv, RewardSum, TransformedEnv
+from torchrl.envs import ParallelEnv, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
@@ -271,7 +271,7 @@ KEYS = ["observation", "action", ("next", "reward"), ("next", "cost")]
 
 @pytest.fixture(scope="module")
 def batch():
-    env = make_env(Config(), num_envs=4, seed=0)
+    env = make_env(Config(), num_envs=4, seed=0).append_transform(StepCounter())  # For CPO.
     _, actor = make_loss()
     with torch.no_grad():
         batch = env.rollout(50, actor, break_when_any_done=False)

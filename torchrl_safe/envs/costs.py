@@ -56,8 +56,7 @@ class Collision:
 
     def __call__(self, state: ArmState) -> Array:
         """Returns the cost of each world, shape ``(N,)``."""
-        # Bullet also pushes where bodies are still a hair apart.
-        touches = ((state.contact_distance <= 0) | (state.contact_force > 0)).any(axis=1)
+        touches = state.touched.any(axis=1)
         if self.margin:
             touches |= (state.trace["clearance"] <= self.margin).any(axis=(1, 2))
         if self.table:

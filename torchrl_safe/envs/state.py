@@ -206,3 +206,13 @@ class ArmState:
     previous: ArmState | None = None
     shield_correction: Array | None = None
     shield_braked: NDArray[np.bool_] | None = None
+
+    @property
+    def touched(self) -> NDArray[np.bool_]:
+        """Which obstacles the arm has touched in the control step, ``(N, m)``."""
+        return touches(self.contact_distance, self.contact_force)
+
+
+def touches(distance: Array, force: Array) -> NDArray[np.bool_]:
+    """What is a touch: bodies that overlap or push, as Bullet's do where still a hair apart."""
+    return (distance <= 0) | (force > 0)
