@@ -57,7 +57,7 @@ def test_train_stop_go_on_and_evaluate(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(safe_gym.Log, "add", stop_in_the_third_batch)
         with pytest.raises(KeyboardInterrupt):
-            safe_gym.train(stopped, progress=False)
+            safe_gym.main(stopped)
     results = safe_gym.main(replace(stopped, resume=True))
     assert results["history"] == log.rows
     assert results["evaluation"]["steps"] == [1_000, 1_000, 1_000]
