@@ -270,8 +270,10 @@ def _with_budget(config: Config) -> list[Transform]:
     return [saute, CatTensors(["observation", "remaining_budget"], "observation", del_keys=False)]
 
 
-def _counting(config: Config) -> list[Transform]:
-    return [StepCounter()]
+def _trust_region(**options: Any) -> OnPolicy:
+    """With the lengths of episodes, which :func:`~experiments.learners.tell_length` reads."""
+    loss = _of_ppo(TrustRegionLoss)
+    return OnPolicy(loss, training_transforms=lambda config: [StepCounter()], **options)
 
 
 def _terminating(config: Config) -> list[Transform]:
@@ -318,24 +320,16 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         # a multiplier that moves as much less in each.
         settings=_A2C,
     ),
-    "trpo": OnPolicy(
-        _of_ppo(TrustRegionLoss), keep_multiplier, method=TRPO(), training_transforms=_counting
-    ),
-    "trpo-lagrangian": OnPolicy(
-        _of_ppo(TrustRegionLoss), method=TRPO(), training_transforms=_counting
-    ),
-    "cpo": OnPolicy(
-        _of_ppo(TrustRegionLoss),
-        partial(tell_violation, errors=2.0),
+    "trpo": _trust_region(updater=keep_multiplier, method=TRPO()),
+    "trpo-lagrangian": _trust_region(method=TRPO()),
+    "cpo": _trust_region(
+        updater=partial(tell_violation, errors=2.0),
         method=CPO(),
-        training_transforms=_counting,
         settings=_TRUST_REGION,
     ),
-    "pcpo": OnPolicy(
-        _of_ppo(TrustRegionLoss),
-        partial(tell_violation, errors=2.0),
+    "pcpo": _trust_region(
+        updater=partial(tell_violation, errors=2.0),
         method=PCPO(),
-        training_transforms=_counting,
         settings=_TRUST_REGION,
     ),
     # Nothing in these losses brings the policy back. Their authors end the passes over a batch once

@@ -58,6 +58,7 @@ def test_at_home_the_arm_touches_neither_table_nor_itself(make_env, arm):
     for opening in (1, -1):
         for _ in range(10):
             assert not step(env, [0, 0, 0, opening])["cost"].any()
+            assert (env.arm_state.trace["table_distance"] > 0.02).all()
     assert trace["table_distance"].shape == trace["self_distance"].shape == (1, 12)
 
 

@@ -233,6 +233,8 @@ def test_all_rows_of_learning_curves_are_seen(tmp_path, monkeypatch):
             low, high = axis.get_ylim()
             assert low < 0.5 < 40 < high
 
+
+def test_a_run_without_a_finished_episode_has_empty_curves(tmp_path):
     runs = {"ppo": {"history": [{"frames": 8, "summed/collision": 0.0}]}}
     plot_curves({"algorithms": runs, "cost_limits": {"collision": 0.5}}, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").exists()

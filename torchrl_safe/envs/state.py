@@ -210,9 +210,9 @@ class ArmState:
     @property
     def touched(self) -> NDArray[np.bool_]:
         """Which obstacles the arm has touched in the control step, ``(N, m)``."""
-        return touches(self.contact_distance, self.contact_force)
+        return is_touch(self.contact_distance, self.contact_force)
 
 
-def touches(distance: Array, force: Array) -> NDArray[np.bool_]:
+def is_touch(distance: Array, force: Array) -> NDArray[np.bool_]:
     """What is a touch: bodies that overlap or push, as Bullet's do where still a hair apart."""
     return (distance <= 0) | (force > 0)

@@ -252,13 +252,15 @@ class DualAscent(MultiplierUpdater):
     def state_dict(self) -> dict[str, Any]:
         return {**super().state_dict(), "optimizer": self.optimizer.state_dict()}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._check_state(state_dict)
+    def _check_state(self, state_dict: dict[str, Any]) -> None:
+        super()._check_state(state_dict)
         own, (group,) = self.optimizer.param_groups[0], state_dict["optimizer"]["param_groups"]
         if own.keys() != group.keys():
             raise ValueError(
                 f"The state is of another optimizer than {type(self.optimizer).__name__}: it has "
                 f"the options {sorted(group)}."
             )
-        self.optimizer.load_state_dict(state_dict["optimizer"])
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         super().load_state_dict(state_dict)
+        self.optimizer.load_state_dict(state_dict["optimizer"])

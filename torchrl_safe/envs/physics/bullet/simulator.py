@@ -20,7 +20,7 @@ from torchrl_safe.envs.physics.bullet.ruler import Ruler
 from torchrl_safe.envs.physics.bullet.world import TOOL_MOTION, World
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Nearest, Saved
-from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace, touches
+from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace, is_touch
 
 if TYPE_CHECKING:
     from torchrl_safe.envs.physics.bullet.physics import Bullet
@@ -203,8 +203,8 @@ class BulletSimulator:
         if self._picture_world is None:
             self._picture_world = World(*self._build, visuals=True)
         pictures = []
-        touched_now = touches(self._contact_distance, self._contact_force)
-        for world, touched in zip(self.worlds, touched_now, strict=True):
+        touches = is_touch(self._contact_distance, self._contact_force)
+        for world, touched in zip(self.worlds, touches, strict=True):
             self._picture_world.copy_from(world)
             self._picture_world.light_up(touched.tolist())
             pictures.append(self._picture_world.picture(camera, width, height))

@@ -26,7 +26,7 @@ from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Nearest, Saved
 from torchrl_safe.envs.rotations import UPRIGHT
-from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace
+from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace, is_touch
 
 
 class MuJoCoSimulator:
@@ -403,8 +403,8 @@ class MuJoCoSimulator:
             names = [obstacle(index) for index in range(len(self._sizes))]
             self._painter = Painter(build_scenery(*self._build), names)
         return self._painter.paint(
-            self._qpos, self._mocap_pos, self._mocap_quat, self._goal, self._contact_distance <= 0,
-            camera, width, height,
+            self._qpos, self._mocap_pos, self._mocap_quat, self._goal,
+            is_touch(self._contact_distance, self._contact_force), camera, width, height,
         )  # fmt: skip
 
     def close(self) -> None:
