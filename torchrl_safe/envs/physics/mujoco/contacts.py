@@ -22,11 +22,17 @@ _SPIN, _ROLL = 0.005, 1e-4
 STIFF = (2 * SUBSTEP, 1.0)
 
 
-def set_options(spec: Any, gravity: float) -> None:
+def set_options(spec: Any, gravity: float, *, standing: bool) -> None:
     """Chooses how the world is simulated.
 
     The integrator sees the stiffness of motors and contacts together; with another one the fingers
     of a gripper drop what they hold.
+
+    Args:
+        spec: the world; changed in place.
+        gravity: m/s^2, downwards.
+        standing: whether physics moves a cylinder, which stands still on several contact points
+            only.
     """
     option = spec.option
     option.timestep = SUBSTEP
@@ -36,6 +42,10 @@ def set_options(spec: Any, gravity: float) -> None:
     option.impratio = 10
     # Show a state that has gone wrong instead of replacing it.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    # Where MuJoCo 4.0 looks for several points, normals and depths of overlaps of a mesh with a
+    # cylinder or a capsule can be wrong.
+    if not standing:
+        option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
 
 
 def set_arm_contacts(spec: Any, frictions: Mapping[str, float], *, itself: bool) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.obstacles.shapes import Shape
+from torchrl_safe.envs.obstacles.shapes import Cylinder, Shape
 from torchrl_safe.envs.physics.mujoco.arm import ArmParts, name_solids, read_arm
 from torchrl_safe.envs.physics.mujoco.bodies import (
     add_object,
@@ -71,7 +71,8 @@ def build_world(
         set_box_inertias(spec)
     except ValueError as error:
         raise ValueError(f"urdf {arm.urdf!r} does not load in MuJoCo: {error}") from error
-    set_options(spec, scene.gravity)
+    standing = any(isinstance(shape, Cylinder) and shape.mass > 0 for shape in (*shapes, *objects))
+    set_options(spec, scene.gravity, standing=standing)
     solids = name_solids(spec)
     _add_bodies(spec, shapes, objects, reach=CONTACT_RANGE)
     add_motors(spec, parts, limited=scene.motor_limits, strength=scene.motor_strength)
