@@ -19,6 +19,7 @@ from experiments import evaluate, suite
 from experiments.config import SET_BY_SUITE, AlgorithmName
 from experiments.files import write_whole
 from experiments.log import versions
+from experiments.suite_report import excess
 from experiments.train import CHANGEABLE
 from torchrl_safe._files import writing
 from torchrl_safe.envs import SUITE
@@ -43,14 +44,20 @@ class Config:
 
 
 def best(runs: list[dict[str, Any]], limits: dict[str, float]) -> dict[str, Any] | None:
-    """The run with most success, then the highest return, of those within every limit."""
-    kept = [
-        run
-        for run in runs
-        if all(run["evaluation"][f"cost/{name}"][0] <= limit for name, limit in limits.items())
-    ]
-    figures = ("success", "return")
-    return max(kept, key=lambda run: [run["evaluation"][f][0] for f in figures], default=None)
+    """The run furthest below its limits, of those that succeed nearly as often as the best.
+
+    Far below a limit there is room for another engine or another arm of the same make.
+    """
+
+    def success(run: dict[str, Any]) -> float:
+        return run["evaluation"]["success"][0]
+
+    def largest(run: dict[str, Any]) -> float:
+        return excess(run["evaluation"], limits)
+
+    kept = [run for run in runs if largest(run) <= 1]
+    often = 0.99 * max(map(success, kept), default=0.0)
+    return min((run for run in kept if success(run) >= often), key=largest, default=None)
 
 
 def contents(file: Path) -> dict[str, Any]:

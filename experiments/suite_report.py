@@ -93,9 +93,9 @@ def whole(runs: Sequence[Run], limits: Limits) -> str:
     ]
     algorithms = _algorithms(runs)
     for algorithm in algorithms:
-        success, excess = scores(runs, limits, algorithm)
-        middle, high = (_interval(interquartile_mean, score) for score in (success, excess))
-        above = _interval(mean, (excess > 1).double())
+        success, largest = scores(runs, limits, algorithm)
+        middle, high = (_interval(interquartile_mean, score) for score in (success, largest))
+        above = _interval(mean, (largest > 1).double())
         # The violation of a task is that of its mean over seeds.
         thrice = sum(
             any(
@@ -120,18 +120,17 @@ def scores(
     runs: Sequence[Run], limits: Limits, algorithm: str
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Success and largest cost in units of the limits, each of shape (tasks, seeds)."""
-    success, excess = [], []
+    success, largest = [], []
     for task in _tasks(runs):
         figures = [run["evaluation"] for run in _select(runs, task, algorithm)]
-        of_task = limits[task].items()
         success.append([figure["success"][0] for figure in figures])
-        excess.append(
-            [
-                max(figure[f"cost/{name}"][0] / limit for name, limit in of_task)
-                for figure in figures
-            ]
-        )
-    return torch.tensor(success, dtype=torch.float64), torch.tensor(excess, dtype=torch.float64)
+        largest.append([excess(figure, limits[task]) for figure in figures])
+    return torch.tensor(success, dtype=torch.float64), torch.tensor(largest, dtype=torch.float64)
+
+
+def excess(evaluation: Mapping[str, Any], limits: Mapping[str, float]) -> float:
+    """The largest cost of an evaluation in units of its limit."""
+    return max(evaluation[f"cost/{name}"][0] / limit for name, limit in limits.items())
 
 
 def profile(
