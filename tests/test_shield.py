@@ -314,6 +314,45 @@ def test_the_tool_stays_in_its_workspace(make_env, engine):
             assert region.contains(env.arm_state.ee_position + np.zeros(3)).all()
 
 
+@pytest.mark.parametrize("mode", [CartesianDelta(), JointDelta()], ids=["cartesian", "joint"])
+def test_nothing_drives_the_tool_out_of_its_workspace(make_env, engine, mode):
+    """Actions turn round every eight steps; at the walls motors have to follow."""
+    region = Region((0.2, -0.15, 0.1), (0.5, 0.15, 0.4))
+    env = make_env(
+        ArmEnv,
+        num_envs=8,
+        action=mode,
+        obstacles=NoObstacles(),
+        shield=Shield(workspace=region),
+        max_episode_steps=99,
+        seed=0,
+    )
+    env.reset()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(10):
+        action = torch.randn(env.action_spec.shape, generator=generator).sign()
+        for _ in range(8):
+            step(env, action)
+            assert region.contains(env.arm_state.ee_position).all()
+
+
+def test_a_tool_outside_its_workspace_moves_in(make_env, engine):
+    """Whatever it is asked for: at home it is 10 cm in front of the box."""
+    region = Region((0.45, -0.1, 0.1), (0.7, 0.1, 0.4))
+    shield = Shield(workspace=region)
+    env = make_env(ArmEnv, obstacles=NoObstacles(), shield=shield, max_episode_steps=99, seed=0)
+    env.reset()
+    assert not region.contains(env.arm_state.ee_position).any()
+    for _ in range(20):
+        step(env, torch.tensor([-1.0, 0.0, 0.0]))
+    assert region.contains(env.arm_state.ee_position).all()
+
+
+def test_a_workspace_without_room_is_refused():
+    with pytest.raises(ValueError, match=r"workspace must be wider than two margins of 0.02 m"):
+        Shield(workspace=Region((0.2, -0.02, 0.1), (0.6, 0.02, 0.4)))
+
+
 def test_the_table_is_left_alone(make_env, engine):
     """The gripper is pressed down, open or closed; without the shield it would touch."""
     action = CartesianDelta(finger_step=0.04)

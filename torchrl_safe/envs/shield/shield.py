@@ -52,7 +52,7 @@ class _Pairs(NamedTuple):
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
     joints: Array
     fingers: Array
-    #: Numbers of the obstacles, ``(r,)``.
+    #: Numbers of the obstacles, then of the table and of the walls, ``(r,)``.
     other: NDArray[np.int_]
 
     def of(self, rows: NDArray[np.int_]) -> _Pairs:
@@ -143,12 +143,13 @@ class Shield:
         obstacle_speed: if given, the shield expects that obstacles can come this fast at any time,
             m/s, and the arm is not the one that moves into contact. ``None`` expects them to keep
             their velocity.
-        workspace: if given, the tool point stays in this box, the margin away from its walls.
+        workspace: if given, the tool point stays in this box, the margin away from its walls. If
+            it begins outside, it moves in.
 
     Raises:
         TypeError: if ``workspace`` is not a Region.
-        ValueError: if a number is negative or not finite, or ``reach`` is not larger than both
-            margins.
+        ValueError: if a number is negative or not finite, ``reach`` is not larger than both
+            margins, or ``workspace`` is not wider than two margins.
 
     Examples:
         >>> from torchrl_safe.envs import ArmEnv
@@ -179,6 +180,11 @@ class Shield:
             check_not_negative(obstacle_speed=self.obstacle_speed)
         if self.workspace is not None:
             check_kind("workspace", self.workspace, Region)
+            if np.any(np.subtract(self.workspace.high, self.workspace.low) <= 2 * self.margin):
+                raise ValueError(
+                    f"workspace must be wider than two margins of {self.margin} m, got "
+                    f"{self.workspace}."
+                )
 
     def __call__(
         self,
@@ -203,30 +209,27 @@ class Shield:
         angles, held = state.joint_position, state.finger_position
         opening = fingers - held if fingers.shape[1] else np.zeros_like(held)
         step = _Step(state, simulator, duration, 1 - np.exp(-self.rate * duration))
-        now = self._measure(step, np.arange(len(angles)), angles, held)
-        pressed = self._is_pressed(state, now)
+        near = self._measure(step, np.arange(len(angles)), angles, held)
+        now = self._with_walls(step, near)
+        pressed = self._is_pressed(state, near)
         asked = np.where(pressed[:, None], 0.0, joints - angles)
         lower, upper = self._bounds(step, now, longest)
         least = self._least(step, now)
         if opening.any():
             least = least - (now.fingers @ opening[:, :, None])[:, :, 0]
         least = _attainable(now.joints, least, lower, upper)
-        rows, least = self._with_walls(step, now.joints, least)
         # If nothing leaves enough room to stop, take what stops above the margin.
-        last = least.copy()
-        pairs = now.room.shape[1]
-        last[:, :pairs] = np.minimum(last[:, :pairs], now.closing - now.room)
-        comes = np.zeros(least.shape, dtype=bool)
-        comes[:, :pairs] = now.closing > 0
-        change, solved, braked = _solve(asked, rows, least, last, comes, lower, upper)
+        last = np.minimum(least, now.closing - now.room)
+        comes = now.closing > 0
+        change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper)
         # Measure the end of the step as well where it could be too near.
-        left = now.room - now.closing + (now.joints @ change[:, :, None])[:, :, 0]
+        left = near.room - near.closing + (near.joints @ change[:, :, None])[:, :, 0]
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
         again = np.flatnonzero(solved & doubt)
         if len(again):
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
             turned = (then.joints @ change[again][:, :, None])[:, :, 0]
-            needed = _needed(step, now.of(again), then) + turned
+            needed = _needed(near.of(again), then) + turned
             # One more step like this one, slowed as far as possible, has to be safe there.
             needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.joints))
             needed = _attainable(then.joints, needed, lower[again], upper[again])
@@ -237,7 +240,7 @@ class Shield:
         if len(again):
             change[again], solved[again], braked[again] = _solve(
                 asked[again],
-                np.concatenate([rows[again], then.joints[short]], axis=1),
+                np.concatenate([now.joints[again], then.joints[short]], axis=1),
                 np.concatenate([least[again], needed[short]], axis=1),
                 np.concatenate([last[again], most[short]], axis=1),
                 np.concatenate([comes[again], then.closing[short] > 0], axis=1),
@@ -326,27 +329,31 @@ class Shield:
             np.clip(turning + slack, lower, np.minimum(upper, _FAR)),
         )
 
-    def _with_walls(self, step: _Step, rows: Array, least: Array) -> tuple[Array, Array]:
-        """Adds the inequalities that keep the tool point in the workspace."""
+    def _with_walls(self, step: _Step, near: _Pairs) -> _Pairs:
+        """Adds the walls of the workspace, from which the tool point keeps away."""
         if self.workspace is None:
-            return rows, least
+            return near
         tool, walls = step.state.ee_position, self.workspace
         linear = step.simulator.jacobian(step.state.joint_position)[:, :3]
         room = np.concatenate([tool - walls.low, walls.high - tool], axis=1) - self.margin
-        inwards = np.concatenate([linear, -linear], axis=1)
-        return (
-            np.concatenate([rows, inwards], axis=1),
-            np.concatenate([least, -self._spare(step, room, inwards)], axis=1),
+        joints = np.concatenate([linear, -linear], axis=1)
+        number = step.state.obstacle_position.shape[1] + 1
+        return _Pairs(
+            room=np.concatenate([near.room, room], axis=1),
+            spare=np.concatenate([near.spare, self._spare(step, room, joints)], axis=1),
+            closing=np.concatenate([near.closing, np.zeros_like(room)], axis=1),
+            joints=np.concatenate([near.joints, joints], axis=1),
+            fingers=np.pad(near.fingers, [(0, 0), (0, room.shape[1]), (0, 0)]),
+            other=np.append(near.other, np.full(room.shape[1], number)),
         )
 
 
-def _needed(step: _Step, now: _Pairs, then: _Pairs) -> Array:
+def _needed(now: _Pairs, then: _Pairs) -> Array:
     """How much further apart each pair at the end of a step has to be than it is, m, ``(k, r)``."""
     # Each shape may use up what the nearest one may.
     kept = np.zeros((len(now.room), now.other.max(initial=0) + 1))
     for other in range(kept.shape[1]):
-        of_other = (now.room - now.spare)[:, now.other == other]
-        nearest = np.where(np.isfinite(of_other), of_other, np.inf).min(axis=1, initial=np.inf)
+        nearest = (now.room - now.spare)[:, now.other == other].min(axis=1, initial=np.inf)
         kept[:, other] = np.where(np.isfinite(nearest), nearest, 0.0)
     return kept[:, then.other] + then.closing - then.room
 
