@@ -9,7 +9,16 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl._utils import seed_generator
-from torchrl.envs import Compose, GymWrapper, RenameTransform, RewardSum, SerialEnv, TransformedEnv
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import (
+    Compose,
+    GymWrapper,
+    RenameTransform,
+    RewardSum,
+    SerialEnv,
+    TransformedEnv,
+    default_info_dict_reader,
+)
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
@@ -112,6 +121,12 @@ def test_any_environment_with_a_cost():
         evaluate(env, still, 20, seed=0, max_steps=2)
     with pytest.raises(ValueError, match="env must have the key 'cost' or 'episode_cost', got"):
         evaluate(plain, still, 1, seed=0)
+    reader = default_info_dict_reader(["cost"], spec=Composite(cost=Unbounded(())))
+    told = GymWrapper(Counting()).set_info_dict_reader(reader)
+    with pytest.raises(
+        ValueError, match=r"cost must have shape \(\*\(\), k\), got \(\)"
+    ):
+        evaluate(told, still, 1, seed=0)
     with pytest.raises(ValueError, match="episodes must be a whole number of at least 1, got 0"):
         evaluate(env, still, 0, seed=0)
     with pytest.raises(ValueError, match=r"cost_names must be one for each of the 2 costs, got \("):

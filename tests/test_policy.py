@@ -244,8 +244,9 @@ def policy(trained):
         (np.zeros((40, 2)), r"observation must have shape .* got \(40, 2\)"),
         (np.zeros((2, 3, 40)), r"observation must have shape .* got \(2, 3, 40\)"),
         (np.float32(1.0), r"observation must have shape .* got \(\)"),
-        (np.full(40, np.nan), r"observation must be finite, got \[nan"),
-        (np.full((2, 40), np.inf), r"observation must be finite, got \[\[inf"),
+        (np.full(40, np.nan), r"observation must be finite in float32, got \[nan"),
+        (np.full((2, 40), np.inf), r"observation must be finite in float32, got \[\[inf"),
+        (np.full(40, 1e39), r"observation must be finite in float32, got \[1.e\+39"),
         (np.zeros(40, dtype=complex), "observation must have dtype float32, got complex128"),
         (["a"] * 40, "observation must have dtype float32, got <U1"),
     ],
@@ -322,6 +323,13 @@ def recurrent():
     return TensorDictSequential(lstm, TensorDictModule(MLP(8, 3), ["features"], ["action"]))
 
 
+def attached():
+    """To what cannot be copied, as a normalization is to an environment that simulates."""
+    net = mlp()
+    net.source = (line for line in ())
+    return deterministic(net)
+
+
 def broken():
     net = mlp()
     torch.nn.init.constant_(net[0][0].weight, torch.nan)
@@ -356,6 +364,8 @@ REFUSED = {
         r"observation_spec must be of one observation, .* \(4,\): pass env.observation_spec_unb",
     ),
     "nan": (broken, {}, ValueError, "actor must give finite actions, got tensor"),
+    "width": (lambda: deterministic(MLP(39, 3)), {}, ValueError, "actor cannot be called: "),
+    "attached": (attached, {}, ValueError, "actor cannot be copied: "),
     "choosy": (lambda: deterministic(Choosy()), {}, ValueError, "actor cannot be recorded: "),
     "truncated": (
         lambda: gaussian(TruncatedNormal, distribution_kwargs={"low": -1.0, "high": 1.0}),

@@ -14,7 +14,9 @@ from torchrl.envs import (
     ParallelEnv,
     RewardSum,
     SerialEnv,
+    StepCounter,
     TransformedEnv,
+    VecNormV2,
 )
 
 from torchrl_safe.collectors import ResumableCollector
@@ -302,6 +304,39 @@ def test_environments_without_a_state_begin_anew(make):
     finally:
         one.shutdown()
         two.shutdown()
+
+
+def test_whole_trajectories_begin_anew():
+    """What a batch left unfinished is not in the state: without its beginning it would be wrong."""
+
+    def collector():
+        env = TransformedEnv(ArmEnv(num_envs=2, max_episode_steps=7), StepCounter())
+        trajectories = {"trajs_per_batch": 3, "traj_format": "padded"}
+        return ResumableCollector(env, make_noisy(env), **SETTINGS, **trajectories)
+
+    one, two = collector(), collector()
+    next(iter(one))
+    two.load_state_dict(one.state_dict())
+    batch = next(iter(two))
+    assert not batch["step_count"][:, 0].any()
+    assert (batch["collector", "mask"].sum(-1) == 7).all()
+    one.shutdown()
+    two.shutdown()
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size")
+def test_nested_transforms_go_on_bit_for_bit():
+    """TorchRL's own state has those of the outermost environment only."""
+
+    def make():
+        norm = VecNormV2(["observation"], reduce_batch_dims=True)
+        inner = TransformedEnv(ArmEnv(num_envs=2, seed=0), norm)
+        env = TransformedEnv(inner, RewardSum(["reward", "cost"]), auto_unwrap=False)
+        return ResumableCollector(env, make_noisy(env), **SETTINGS)
+
+    expected, got = collect(make, 3)
+    for one, two in zip(expected, got, strict=True):
+        assert_equal(one, two)
 
 
 def test_the_state_can_be_sent_by_a_worker():

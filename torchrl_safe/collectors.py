@@ -25,10 +25,12 @@ class ResumableCollector(Collector):
 
     A collector that loads a state from between two batches collects what the saved one would have
     collected, bit for bit. The environment needs a complete ``state_dict``, as
-    :class:`~torchrl_safe.envs.ArmEnv` has; any transforms may be around it. Environments whose
-    state has no ``get_extra_state`` in it, and those in a :class:`~torchrl.envs.ParallelEnv`, begin
-    their episodes anew. It also works in worker processes, as the ``collector_class`` of
-    :class:`~torchrl.collectors.MultiSyncCollector` (trajectories may have other numbers there).
+    :class:`~torchrl_safe.envs.ArmEnv` has; any transforms may be around it. Episodes begin anew in
+    environments whose state has no ``get_extra_state`` in it, in a
+    :class:`~torchrl.envs.ParallelEnv`, and with ``trajs_per_batch``, where a batch leaves parts of
+    trajectories behind that are not in the state. It also works in worker processes, as the
+    ``collector_class`` of :class:`~torchrl.collectors.MultiSyncCollector` (trajectories may have
+    other numbers there).
 
     After the last of ``total_frames`` a collector closes its environment, which then has no state.
     To save after the last batch, pass ``total_frames=-1`` and stop the loop yourself.
@@ -61,9 +63,11 @@ class ResumableCollector(Collector):
     def state_dict(self) -> OrderedDict:
         """Returns the state between two batches."""
         state = super().state_dict()
-        env = _innermost(self.env)
+        *around, env = _inner_envs(self.env)
+        state.update({f"inner_env_{n}": level.state_dict() for n, level in enumerate(around)})
         # A ParallelEnv reads its first step after a load before it is there (TorchRL 0.14.1).
-        if not isinstance(env, ParallelEnv) and _is_complete(simulator := env.state_dict()):
+        goes_on = self.trajs_per_batch is None and not isinstance(env, ParallelEnv)
+        if goes_on and _is_complete(simulator := env.state_dict()):
             state["base_env_state_dict"] = simulator
             state["carrier"] = self._carrier.exclude("next").clone().to_dict()
         # Tensors only: workers send their state as a TensorDict.
@@ -75,10 +79,13 @@ class ResumableCollector(Collector):
     def load_state_dict(self, state_dict: OrderedDict, **kwargs: Any) -> None:
         """Loads a state that :meth:`state_dict` returned; that of a ``Collector`` as it does."""
         super().load_state_dict(state_dict, **kwargs)
-        if "traj_pool" in state_dict:  # The method above has drawn new numbers from it.
-            self._traj_pool.load_state_dict(state_dict["traj_pool"])
+        *around, env = _inner_envs(self.env)
+        for n, level in enumerate(around):
+            level.load_state_dict(state_dict[f"inner_env_{n}"])
         if "carrier" in state_dict:
-            _innermost(self.env).load_state_dict(state_dict["base_env_state_dict"])
+            env.load_state_dict(state_dict["base_env_state_dict"])
+            # The method above has drawn numbers from it for trajectories that begin.
+            self._traj_pool.load_state_dict(state_dict["traj_pool"])
             self._carrier = TensorDict(
                 state_dict["carrier"],
                 batch_size=self._carrier.batch_size,
@@ -100,7 +107,10 @@ def _is_complete(state: Mapping[str, Any]) -> bool:
     )
 
 
-def _innermost(env: EnvBase) -> EnvBase:
+def _inner_envs(env: EnvBase) -> list[EnvBase]:
+    """What the state of a ``Collector`` leaves out: the environments inside of the outermost."""
+    inner = []
     while isinstance(env, TransformedEnv):
         env = env.base_env
-    return env
+        inner.append(env)
+    return inner or [env]

@@ -71,10 +71,16 @@ def evaluate(
         ['success', 'return', 'steps', 'cost/collision', 'any/collision']
     """
     check_count(episodes=episodes, max_steps=max_steps)
-    names = list(env.full_observation_spec.keys()) + list(env.full_reward_spec.keys())
+    specs = {**env.full_observation_spec, **env.full_reward_spec}
     for name in ("reward", "cost"):
-        if name not in names and f"episode_{name}" not in names:
-            raise ValueError(f"env must have the key {name!r} or 'episode_{name}', got {names}.")
+        spec = specs.get(f"episode_{name}", specs.get(name))
+        if spec is None:
+            raise ValueError(f"env must have the key {name!r} or 'episode_{name}', got {[*specs]}.")
+        if len(spec.shape) != env.ndim + 1:
+            raise ValueError(
+                f"{name} must have shape (*{tuple(env.shape)}, k), got {tuple(spec.shape)}: "
+                "CostToReward makes a cost of an observation."
+            )
     rounds = []
     with set_exploration_type(ExplorationType.DETERMINISTIC), _in_evaluation_mode(policy):
         for _ in range(math.ceil(episodes / env.batch_size.numel())):

@@ -115,9 +115,11 @@ class Policy:
             raise ValueError(
                 f"observation must have shape ({shape},) or (B, {shape}), got {given.shape}."
             )
-        if not np.isfinite(given).all():
-            raise ValueError(f"observation must be finite, got {given}.")
-        rows = torch.from_numpy(np.array(given, dtype=self.observation_dtype))
+        with np.errstate(over="ignore"):  # What is too large becomes infinite.
+            converted = np.array(given, dtype=self.observation_dtype)
+        if not np.isfinite(converted).all():
+            raise ValueError(f"observation must be finite in {converted.dtype}, got {given}.")
+        rows = torch.from_numpy(converted)
         with torch.no_grad():
             # A copy, so that nobody can change an action that is a constant.
             return np.array(self.actor.module(rows).numpy())
@@ -142,7 +144,8 @@ def save_policy(
     The file holds the deterministic policy, in evaluation mode. :func:`torch.export.export` records
     it, so that :func:`load_policy` needs no code of yours, whatever networks and distributions the
     actor is made of. Transforms of the environment are not part of the actor: to save a
-    normalization with it, put it in front, ``TensorDictSequential(normalization, actor)``.
+    normalization with it, put it in front, ``TensorDictSequential(normalization, actor)``. Of a
+    :class:`~torchrl.envs.VecNormV2` that is its ``to_observation_norm()``.
 
     The file is written all at once. If saving fails, the file that was there stays.
 
@@ -160,8 +163,9 @@ def save_policy(
 
     Raises:
         ValueError: if the actor cannot be saved. Either it reads several keys (a recurrent actor
-            reads its state) or writes no action. Or it cannot be recorded, because Python code in
-            it decides by the values of a tensor, as :class:`~torchrl.modules.TruncatedNormal` does.
+            reads its state) or writes no action. Or it cannot be copied, called or recorded;
+            Python code in it must not decide by the values of a tensor, as that of
+            :class:`~torchrl.modules.TruncatedNormal` does.
 
     Examples:
         >>> import tempfile
@@ -197,7 +201,10 @@ def save_policy(
                 f"{tuple(spec.shape)}: pass env.observation_spec_unbatched."
             )
         spec = spec[observation_key]
-    actor = copy.deepcopy(actor).cpu().eval()
+    try:
+        actor = copy.deepcopy(actor).cpu().eval()
+    except Exception as error:  # Whatever the actor's own parts raise.
+        raise ValueError(f"actor cannot be copied: {error}") from error
     weights = {name: _own(value) for name, value in actor.state_dict().items()}
     function = _Deterministic(actor, observation_key, action_key)
     # Leave the caller's random numbers alone.
@@ -209,12 +216,15 @@ def save_policy(
         rows = spec.cpu().rand((3,))
         if rows.is_floating_point():  # TorchRL draws no number where a bound is infinite.
             rows = torch.where(rows.isfinite(), rows, torch.randn_like(rows))
-        action, first = function(rows), function(rows[:1])
+        try:
+            action, first = function(rows), function(rows[:1])
+        except Exception as error:
+            raise ValueError(f"actor cannot be called: {error}") from error
         if not action.isfinite().all():
             raise ValueError(f"actor must give finite actions, got {action[0]}.")
         try:
             steps, tensors = record(function, rows)
-        except Exception as error:  # Whatever the actor's own code and PyTorch's tracing raise.
+        except Exception as error:  # PyTorch's tracing has errors of its own, too.
             raise ValueError(f"actor cannot be recorded: {error}") from error
     contents = {
         "format": _FORMAT,

@@ -73,7 +73,8 @@ class _CostBesideReward(GymWrapper):
         if self._vectorized and self.wrapper_frame_skip > 1:
             raise ValueError(
                 "frame_skip must be 1 for several environments, whose episodes end at different "
-                f"frames, got {self.wrapper_frame_skip}: append FrameSkip to the environment."
+                f"frames, got {self.wrapper_frame_skip}: put single ones in a SerialEnv or a "
+                "ParallelEnv."
             )
         self._resets_itself = self._vectorized and autoreset.resets_itself(self._env)
 

@@ -98,7 +98,7 @@ class Shield:
     Inside the margin, where r is negative, :math:`s = (1 - e^{-\text{rate} \cdot T}) r` makes the
     arm move away.
 
-    The bounds l and u keep joints within their limits and speeds, and within what motors can
+    The bounds l and u keep joint targets within limits and speeds, and within what motors can
     follow. A joint's velocity changes by no more than ``acceleration`` allows, or by what takes up
     the remaining room, whichever is more. Far from everything the shield therefore changes nothing.
 

@@ -18,6 +18,9 @@ class FrameSkip(FrameSkipTransform):
     a row keeps its first ``done`` and what came with it, and later steps do not count.
     :class:`~torchrl_safe.envs.ArmEnv` needs neither: its own ``frame_skip`` is faster.
 
+    Rows that have ended are stepped until all have, which Gymnasium's vectorized environments do
+    not allow: put single ones in a :class:`~torchrl.envs.SerialEnv`, each with its own FrameSkip.
+
     Args:
         frame_skip (int, optional): how often an action is taken. Defaults to ``1``.
 
