@@ -108,6 +108,22 @@ def make_heads(num_costs=2, hidden="hidden"):
     return trunk, (model.get_policy_operator(), value_head, cost_head)
 
 
+def test_a_call_without_advantages_has_the_gradients_of_one_with_them():
+    """Value targets have none, not even by the trunk that computes the critics' inputs."""
+    trunk, networks = make_heads()
+    loss = PPOLagrangianLoss(*networks, num_costs=2, entropy_bonus=False)
+    data = make_batch(2)
+    with torch.no_grad():
+        networks[0](data)
+    ready = loss.estimate_advantages(data.clone()).reshape(-1)
+    for name in ("loss_objective", "loss_critic", "loss_cost_critic"):
+        one, two = (
+            torch.autograd.grad(loss(each.clone())[name], [trunk.weight])[0]
+            for each in (data, ready)
+        )
+        torch.testing.assert_close(one, two)
+
+
 def minibatch(num_costs=2):
     """Steps with advantages and targets, and features that an older trunk has left."""
     torch.manual_seed(2)

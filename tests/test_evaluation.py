@@ -123,9 +123,7 @@ def test_any_environment_with_a_cost():
         evaluate(plain, still, 1, seed=0)
     reader = default_info_dict_reader(["cost"], spec=Composite(cost=Unbounded(())))
     told = GymWrapper(Counting()).set_info_dict_reader(reader)
-    with pytest.raises(
-        ValueError, match=r"cost must have shape \(\*\(\), k\), got \(\)"
-    ):
+    with pytest.raises(ValueError, match=r"cost must have shape \(\*\(\), k\), got \(\)"):
         evaluate(told, still, 1, seed=0)
     with pytest.raises(ValueError, match="episodes must be a whole number of at least 1, got 0"):
         evaluate(env, still, 0, seed=0)

@@ -19,10 +19,10 @@ from first_order import (
 )
 from on_policy import estimated, make_loss
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torch.distributions import Categorical, Independent, kl_divergence
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch.distributions import Categorical, Independent, Normal, kl_divergence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import MaskedCategorical, ProbabilisticActor
+from torchrl.modules import MLP, IndependentNormal, MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss, PPOLoss, SoftUpdate
 
 from torchrl_safe.objectives import (
@@ -30,6 +30,7 @@ from torchrl_safe.objectives import (
     FOCOPSLoss,
     IPOLoss,
     P3OLoss,
+    TrustRegionLoss,
     penalized_advantage,
 )
 from torchrl_safe.objectives.on_policy.crpo import rectified_advantage
@@ -130,6 +131,60 @@ def test_focops_by_hand():
         actor_gradient(loss, losses["loss_kl"] + losses["loss_objective"]),
         actor_gradient(loss, expected),
     )
+
+
+def term(loss, data):
+    """What a method adds to the objective of the reward, or puts in its place."""
+    if isinstance(loss, CUPLoss):
+        loss.start_projection()
+        return loss.projection_loss(data)["loss_projection"]
+    if isinstance(loss, TrustRegionLoss):
+        return loss.cost_surrogate_loss(data).sum()
+    losses = loss(data)
+    return losses["loss_objective" if isinstance(loss, FOCOPSLoss) else "loss_penalty"]
+
+
+@pytest.mark.parametrize("num_actions", [1, 3])
+@pytest.mark.parametrize(
+    "make", [FOCOPSLoss, CUPLoss, P3OLoss, IPOLoss, TrustRegionLoss], ids=lambda make: make.__name__
+)
+def test_a_log_probability_of_each_part_is_added_up(make, num_actions):
+    """Of the same policy, summed or not: the same gradient. Costs meet their own states."""
+    gradients = []
+    for distribution in (IndependentNormal, Normal):
+        torch.manual_seed(0)
+        net = torch.nn.Sequential(MLP(4, 2 * num_actions), NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictModule(net, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=distribution,
+            return_log_prob=True,
+        )
+        loss = make(actor, make_critic(), make_critic("cost_value"), entropy_bonus=False)
+        for name in loss.cost_buffers:
+            getattr(loss, name).fill_(2.0)
+        data = make_batch(1).exclude("action", "action_log_prob", "loc", "scale")
+        with torch.no_grad():
+            data = loss.estimate_advantages(actor(data)).reshape(-1)
+        gradients.append(actor_gradient(loss, term(loss, data)))
+    assert gradients[0].norm() > 0.1
+    torch.testing.assert_close(*gradients)
+
+
+def test_cup_of_an_actor_without_shapes():
+    """It has none where the loss is made; they come with the first batch."""
+    net = torch.nn.Sequential(torch.nn.LazyLinear(4), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(net, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    loss = CUPLoss(actor, make_critic(), make_critic("cost_value"))
+    data = loss.estimate_advantages(make_batch(1)).reshape(-1)
+    loss(data)
+    loss.start_projection()
+    assert loss.projection_loss(data)["kl"] == 0
 
 
 @pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
@@ -450,15 +505,18 @@ def test_a_masked_action_leaves_the_gradients_finite(make, distribution, width):
 
 def test_the_divergence_of_independent_categories_is_pytorchs():
     logits = torch.randn(2, 5, 2, 3, generator=torch.Generator().manual_seed(0))
-    for summed in (0, 1, 2):
+    for summed, shape in ((0, (5, 2)), (1, (5,)), (2, ())):
         old, new = (Independent(Categorical(logits=each), summed) for each in logits)
-        torch.testing.assert_close(divergence(old, new), kl_divergence(old, new))
+        expected = kl_divergence(old, new).unsqueeze(-1)
+        torch.testing.assert_close(divergence(old, new, torch.Size(shape)), expected)
 
 
 def test_the_divergence_of_categories_is_pytorchs():
     old, new = (torch.distributions.Categorical(logits=torch.randn(5, 3)) for _ in range(2))
-    assert torch.equal(divergence(old, new), kl_divergence(old, new))
+    shape = torch.Size([5])
+    assert torch.equal(divergence(old, new, shape), kl_divergence(old, new).unsqueeze(-1))
     # What the new policy excludes and the old one does not is infinitely far away.
     excluding = torch.distributions.Categorical(probs=torch.tensor([0.5, 0.5, 0.0]))
     everything = torch.distributions.Categorical(probs=torch.ones(3))
-    assert divergence(everything, excluding) == kl_divergence(everything, excluding) == math.inf
+    assert divergence(everything, excluding, torch.Size([])) == math.inf
+    assert kl_divergence(everything, excluding) == math.inf

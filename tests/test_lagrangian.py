@@ -16,6 +16,7 @@ from tensordict.nn import (
 from tensordict.utils import unravel_key
 from torch import nn
 from torch.distributions.transforms import SoftplusTransform
+from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal, PopArtValueNorm, ValueOperator, recurrent_mode
 from torchrl.objectives import (
     A2CLoss,
@@ -354,6 +355,16 @@ def test_the_entry_that_masks_is_that_of_the_wrapped_loss():
     losses = loss(data)
     for key in ("loss_objective", "loss_critic", "loss_cost_critic"):
         torch.testing.assert_close(losses[key], expected[key])
+
+
+def test_the_mode_of_sampling_is_that_of_the_wrapped_loss():
+    loss = wrap(ClipPPOLoss)
+    seen = []
+    for module in loss.actor_network.modules():
+        module.register_forward_pre_hook(lambda *_: seen.append(exploration_type()))
+    loss.deterministic_sampling_mode = ExplorationType.RANDOM
+    loss(loss.estimate_advantages(make_batch()).reshape(-1))
+    assert set(seen) == {ExplorationType.RANDOM}
 
 
 def test_coefficients_of_the_wrapped_loss_can_be_scheduled():

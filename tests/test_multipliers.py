@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 import torch
 from on_policy import make_loss
-from torch.distributions.transforms import SoftplusTransform
+from torch.distributions.transforms import ExpTransform, SoftplusTransform
 from torchrl.objectives import LossModule
 
 from torchrl_safe.objectives import DualAscent, MultiplierUpdater, PIDControl
@@ -348,6 +348,39 @@ def test_limits_go_by_name(rule):
         assert expected[0] > 0 == expected[1]
     assert plain.cost_names == ("0", "1")
     plain.load_state_dict(named[0].state_dict())
+    named[0].load_state_dict(plain.state_dict())
+
+
+@every_rule
+def test_the_state_of_costs_in_another_order_is_refused(rule):
+    """Their limits would be swapped."""
+    names = tuple(NAMED)
+    one, two = (
+        rule(make_module(0.0, 0.0), cost_limit=NAMED, cost_names=order)
+        for order in (names, names[::-1])
+    )
+    with pytest.raises(ValueError, match=r"The state has the costs \['collision', 'speed'\], this"):
+        two.load_state_dict(one.state_dict())
+    assert two.cost_limit.tolist() == [2.0, 0.5]
+
+
+def test_a_refused_step_leaves_the_optimizer_as_it_was():
+    """Its momentum, which would carry the next step away as well."""
+    one, two = (
+        DualAscent(
+            make_module(1.0),
+            cost_limit=1.0,
+            lr=0.01,
+            optimizer=partial(torch.optim.SGD, momentum=0.9),
+            parametrization=ExpTransform(),
+        )
+        for _ in range(2)
+    )
+    with pytest.raises(ValueError, match=r"finite numbers, got .*inf.* for a violation of .*99999"):
+        one.step(torch.tensor([[1e5]]))
+    for updater in (one, two):
+        updater.step(torch.tensor([[0.0]]))
+    assert torch.equal(one.loss_module.lagrange_multiplier, two.loss_module.lagrange_multiplier)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import OneHotCategorical, ProbabilisticActor, ValueOperator
-from torchrl.objectives import A2CLoss, ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives import (
     CPO,
@@ -125,13 +125,29 @@ def test_a_wrapped_loss_does_the_same():
     assert torch.equal(ours, theirs)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_crpo_takes_the_same_steps_in_any_unit_of_the_cost(unit):
+    """Beside steps for the reward: their sizes are in proportion to nothing."""
+    gradients = []
+    for factor in (1.0, unit):
+        actor, critic, cost_critic = make_networks()
+        for parameter in [*cost_critic.parameters()][-2:]:  # Of its last layer.
+            parameter.data.mul_(factor)
+        loss = CRPOLoss(ClipPPOLoss(actor, critic, entropy_bonus=False), cost_critic)
+        loss.cost_violation.fill_(factor)
+        data = make_batch(1)
+        data["next", "cost"] *= factor
+        data = loss.estimate_advantages(data)
+        gradients.append(torch.autograd.grad(loss(data)["loss_objective"], actor.parameters()))
+    for one, two in zip(*gradients, strict=True):
+        assert one.norm() > 1e-3
+        torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.parametrize("make", [P3OLoss, IPOLoss])
 def test_losses_that_read_a_violation_keep_the_unit_of_the_cost(make):
     with pytest.raises(TypeError, match="normalize_cost_advantage is not supported"):
         make(*make_networks(), normalize_cost_advantage=True)
-    actor, critic, cost_critic = make_networks()
-    with pytest.raises(TypeError, match="normalize_cost_advantage"):
-        CRPOLoss(A2CLoss(actor, critic), cost_critic, normalize_cost_advantage=True)
     with pytest.raises(TypeError, match="normalize_cost_advantage must be a bool, got 1"):
         make_loss(normalize_cost_advantage=1)
 

@@ -9,6 +9,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from torch.distributions.transforms import SoftplusTransform
 
 from torchrl_safe.envs import IIWA, ArmEnv, Scattered
 from torchrl_safe.objectives import (
@@ -123,6 +124,18 @@ def test_another_rule_and_two_costs(example):
     assert dual.cost_limit.tolist() == updater.cost_limit.tolist() == [1, 2]
     updater.step(torch.tensor([[3.0, 2.0]]))
     assert loss.lagrange_multiplier.tolist() == pytest.approx([0.6, 0])  # A violation of 1 at most.
+
+
+def test_another_parametrization(example):
+    text = (example / "config.yaml").read_text(encoding="utf-8")
+    text = text.replace("updater: pid_control", "updater: dual_ascent")
+    (example / "dual.yaml").write_text(text, encoding="utf-8")
+    softplus = "torch.distributions.transforms.SoftplusTransform"
+    chosen = ["updater.lr=0.1", f"updater.parametrization._target_={softplus}"]
+    with initialize_config_dir(str(example), version_base="1.3"):
+        config = compose("dual", overrides=chosen)
+    updater = instantiate(config.updater)(instantiate(config.loss, multiplier_init=1.0))
+    assert isinstance(updater.parametrization, SoftplusTransform)
 
 
 def test_a_loss_that_reads_violations(example):

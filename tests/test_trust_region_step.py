@@ -444,20 +444,26 @@ def test_tied_weights_move_together_and_buffers_stay(functional):
 
 
 def test_every_part_of_an_action_counts():
-    """A distribution that is not summed over its parts: each has its own ratio and divergence."""
+    """Of a distribution that is not summed over them: the step is that of one that is."""
     loss = PPOLoss(normal_actor(Normal), make_critic(), entropy_bonus=False)
     torch.manual_seed(0)
     data = act(
         loss, TensorDict(observation=torch.randn(BATCH, OBSERVATION_SIZE), batch_size=[BATCH])
     )
     data["advantage"], data["value_target"] = torch.randn(2, BATCH, 1)
-    old, before = distribution(loss, data), loss(data)["loss_objective"]
-    info = TrustRegionStep(loss, max_kl=MAX_KL).step(data)
+    summed = PPOLoss(normal_actor(IndependentNormal), make_critic(), entropy_bonus=False)
+    summed.actor_network_params.data.copy_(loss.actor_network_params.data)
+    joint = data.clone()
+    joint["action_log_prob"] = data["action_log_prob"].sum(-1)
+    old = distribution(loss, data)
+    info, expected = (
+        TrustRegionStep(each, max_kl=MAX_KL).step(batch)
+        for each, batch in ((loss, data), (summed, joint))
+    )
     kl = kl_divergence(old, distribution(loss, data))
     assert kl.shape == (BATCH, ACTION_SIZE)
-    torch.testing.assert_close(info["kl"], kl.mean())
-    gain = before - loss(data)["loss_objective"]
-    torch.testing.assert_close(info["surrogate_gain"], gain, rtol=0, atol=1e-6)
+    torch.testing.assert_close(info["kl"], kl.sum(-1).mean())
+    torch.testing.assert_close(info, expected)
 
 
 @pytest.mark.parametrize(

@@ -35,8 +35,7 @@ def scaled_advantages(
       losses) a multiplier has no unit: it says how many standard deviations of the reward
       advantage one standard deviation of the cost advantage is worth.
 
-    Losses that compare a cost advantage with a violation (P3O, IPO, CRPO, CPO, PCPO) need both in
-    the unit of the cost.
+    P3O and IPO compare a cost advantage with a violation, and need both in the unit of the cost.
 
     Args:
         advantage (Tensor): reward advantage, shape ``(*B, 1)``.

@@ -29,6 +29,7 @@ except ImportError as error:
     raise ImportError(
         'torchrl_safe.trainers.configs needs Hydra: pip install "torchrl-safe[hydra]".'
     ) from error
+from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 from torchrl.trainers.algorithms.configs.common import ConfigBase, _normalize_hydra_key
 from torchrl.trainers.algorithms.configs.envs_libs import EnvLibsConfig
@@ -101,6 +102,7 @@ class CRPOLossConfig(WrappingLossConfig):
     """Configuration of :class:`~torchrl_safe.objectives.CRPOLoss`."""
 
     tolerance: float = 0.0
+    normalize_cost_advantage: bool = True
     _target_: str = "torchrl_safe.objectives.CRPOLoss"
 
 
@@ -137,10 +139,16 @@ class DualAscentConfig(UpdaterConfig):
     max_multiplier: float | None = None
     normalize: bool = False
     optimizer: Any = field(default_factory=partial(_of, "torch.optim.SGD", _partial_=True))
-    parametrization: Any = field(  # The identity, as torch makes it.
-        default_factory=partial(_of, "torch.distributions.transforms.ComposeTransform", parts=())
+    # Without arguments, which another one would keep.
+    parametrization: Any = field(
+        default_factory=partial(_of, "torchrl_safe.trainers.configs._make_identity")
     )
     _target_: str = "torchrl_safe.objectives.DualAscent"
+
+
+def _make_identity() -> Transform:
+    """Returns the parametrization that leaves a multiplier as it is."""
+    return identity_transform
 
 
 @dataclass

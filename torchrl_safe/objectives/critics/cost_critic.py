@@ -105,7 +105,6 @@ class CostCritic(CostValues):
             "terminated": self.tensor_keys.terminated,
         }
 
-    @torch.no_grad()
     def estimate_advantages(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes advantages and value targets of reward and costs, for a whole batch.
 
@@ -133,6 +132,8 @@ class CostCritic(CostValues):
             self._estimate_advantages(tensordict)
         return tensordict
 
+    # Without: in a call of the loss, value targets would have a gradient by a shared trunk.
+    @torch.no_grad()
     def _estimate_advantages(self, tensordict: TensorDictBase) -> None:
         keys = self.tensor_keys
         if self.critic_network is None:

@@ -27,6 +27,7 @@ from torchrl_safe.objectives.critics.cost_values import (
     report_each,
 )
 from torchrl_safe.objectives.functional import cost_advantage_scale
+from torchrl_safe.objectives.on_policy.policies import summed
 
 
 class ConstrainedLoss(CostCritic):
@@ -40,6 +41,8 @@ class ConstrainedLoss(CostCritic):
     # What tells the loss of its constraints: buffers of shape (k,) that an updater writes. Each
     # call reports them.
     cost_buffers: ClassVar[tuple[str, ...]] = ("lagrange_multiplier",)
+    # Whether the method compares cost advantages with violations: they keep the unit of the cost.
+    keeps_cost_unit: ClassVar[bool] = False
     # What policy_losses returns beside the outputs of the unconstrained loss.
     policy_out_keys: ClassVar[tuple[str, ...]] = ()
 
@@ -57,14 +60,13 @@ class ConstrainedLoss(CostCritic):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        has_multipliers = "lagrange_multiplier" in self.cost_buffers
         if normalize_cost_advantage is None:
-            normalize_cost_advantage = has_multipliers
+            normalize_cost_advantage = not self.keeps_cost_unit
         if not isinstance(normalize_cost_advantage, bool):
             raise TypeError(
                 f"normalize_cost_advantage must be a bool, got {normalize_cost_advantage!r}."
             )
-        if normalize_cost_advantage and not has_multipliers:
+        if normalize_cost_advantage and self.keeps_cost_unit:
             raise TypeError(
                 f"{type(self).__name__} compares the cost advantage with a violation, in the unit "
                 "of the cost: normalize_cost_advantage is not supported."
@@ -79,7 +81,8 @@ class ConstrainedLoss(CostCritic):
             start = multiplier if name == "lagrange_multiplier" else torch.zeros_like(multiplier)
             self.register_buffer(name, start.to(self.cost_critic_coeff.device))
         if normalize_cost_advantage:
-            self.register_buffer("cost_advantage_scale", torch.zeros_like(self.lagrange_multiplier))
+            scale = torch.zeros_like(multiplier, device=self.cost_critic_coeff.device)
+            self.register_buffer("cost_advantage_scale", scale)
 
     @torch.no_grad()
     def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
@@ -122,7 +125,7 @@ class Policy(NamedTuple):
     ``log_ratio`` is the logarithm of the ratio that PPO clips, to the proximal policy, and
     ``log_correction`` what makes it that to the policy that collected the batch, or ``None`` if
     these two are one (see ``delay_actor`` and ``max_importance_ratio`` of TorchRL's losses). Both
-    have shape ``(*B, 1)``.
+    have shape ``(*B, 1)``, or ``(*B, ..., 1)`` if the log-probability has more than one number.
     """
 
     log_ratio: Tensor
@@ -135,6 +138,18 @@ class Policy(NamedTuple):
         if self.log_correction is None:
             return self.log_ratio.exp()
         return (self.log_ratio + self.log_correction).exp()
+
+    def joint(self, shape: torch.Size) -> Policy:
+        """The same with one ratio for each state; ``shape`` is that of the states.
+
+        PPO clips the ratio of each part of an action by itself if the log-probability is not one
+        number, as that of :class:`torch.distributions.Normal`.
+        """
+        correction = self.log_correction
+        return self._replace(
+            log_ratio=summed(self.log_ratio, shape),
+            log_correction=None if correction is None else summed(correction, shape),
+        )
 
 
 @dataclass

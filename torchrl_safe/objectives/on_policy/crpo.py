@@ -92,9 +92,12 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
             Defaults to ``1.0``.
         separate_losses (bool, optional): leave parameters that the cost critic shares with the
             policy out of the cost critic's loss. Defaults to ``False``.
+        normalize_cost_advantage (bool, optional): divide the cost advantages by their standard
+            deviation, as :func:`~torchrl_safe.objectives.scaled_advantages` says. Steps for a cost
+            are then as large as those for the reward, in whatever unit it is. Defaults to ``True``.
 
     Raises:
-        TypeError: if ``separate_losses`` is not a bool.
+        TypeError: if ``separate_losses`` or ``normalize_cost_advantage`` is not a bool.
         ValueError: if ``loss_module`` reads no advantage or normalizes the one it is given, or
             ``num_costs`` or ``tolerance`` is not usable; in a call, if the cost critic or the
             costs have another width than ``num_costs``.
@@ -135,6 +138,7 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
         tolerance: float = 0.0,
         cost_critic_coeff: float = 1.0,
         separate_losses: bool = False,
+        normalize_cost_advantage: bool = True,
     ) -> None:
         super().__init__(
             loss_module,
@@ -142,6 +146,7 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
             num_costs=num_costs,
             cost_critic_coeff=cost_critic_coeff,
             separate_losses=separate_losses,
+            normalize_cost_advantage=normalize_cost_advantage,
         )
         tolerance = check_number("tolerance", tolerance)
         self.register_coeff_buffer("tolerance", tolerance, device=self.cost_critic_coeff.device)

@@ -164,7 +164,12 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
 
     def start_projection(self) -> None:
         """Keeps the policy as it is now, for :meth:`projection_loss` to stay near it."""
-        self.improved_actor_params.data.update_(self._actor_params().data)
+        kept, present = self.improved_actor_params.data, self._actor_params().data
+        if any(kept[key].shape != value.shape for key, value in present.items(True, True)):
+            # A lazy actor has got its shapes since.
+            self.improved_actor_params = TensorDictParams(present.clone(), no_convert=True)
+        else:
+            kept.update_(present)
 
     def projection_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of the second phase. It trains the policy alone.
@@ -184,8 +189,9 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
         tensordict = tensordict.clone(False)
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
         improved = self._improved_policy(tensordict)
-        policy = self.evaluate(tensordict)
-        kl = divergence(policy.distribution, improved).unsqueeze(-1)
+        shape = cost_advantage.shape[:-1]
+        policy = self.evaluate(tensordict).joint(shape)
+        kl = divergence(policy.distribution, improved, shape)
         objective = projection_objective(
             kl, policy.ratio(), cost_advantage, self.lagrange_multiplier, self._cost_scale()
         )

@@ -131,9 +131,10 @@ class FOCOPSLoss(ConstrainedPPO, PPOLoss):
         old = self.actor_network.build_dist_from_params(
             tensordict.select(*self._distribution_keys())
         )
-        policy = self.evaluate(tensordict)
+        shape = cost_advantage.shape[:-1]
+        policy = self.evaluate(tensordict).joint(shape)
         # D_KL(pi_theta || pi_theta_k)
-        kl = divergence(policy.distribution, old).unsqueeze(-1)
+        kl = divergence(policy.distribution, old, shape)
         far = kl > self.kl_bound
         # A_r - sum_i nu_i A_ci
         gain = penalized_advantage(

@@ -102,27 +102,35 @@ def importance_weight(
             which a ratio is lowered to it, its gradient in proportion.
         distribution (Distribution): the policy in the states of the batch.
         tensordict (TensorDictBase): the batch.
-        shape (torch.Size): shape of its states, to which composite actions are summed.
+        shape (torch.Size): shape of its states.
 
     Returns:
-        The ratio, shape ``(*shape, 1)``; ``(*shape, parts, 1)`` for actions of several
-        distributions that are not summed.
+        The ratio, shape ``(*shape, 1)``.
     """
-    log_weight = _log_ratio(loss.tensor_keys, distribution, tensordict, shape).unsqueeze(-1)
+    log_weight = summed(_log_ratio(loss.tensor_keys, distribution, tensordict, shape), shape)
     if loss.max_importance_ratio is not None:
         excess = log_weight.detach() - loss.max_importance_ratio.log()
         log_weight = log_weight - excess.clamp_min(0)
     return log_weight.exp()
 
 
-def divergence(old: Distribution, new: Distribution) -> Tensor:
-    """KL divergence of each state, added up over the parts of a composite."""
+def divergence(old: Distribution, new: Distribution, shape: torch.Size) -> Tensor:
+    """KL divergence of each state, added up over the parts of its action, ``(*shape, 1)``."""
     if isinstance(old, CompositeDistribution) and isinstance(new, CompositeDistribution):
-        parts = [divergence(part, new.dists[name]) for name, part in old.dists.items()]
+        parts = [divergence(part, new.dists[name], shape) for name, part in old.dists.items()]
         return torch.stack(parts).sum(0)
+    return summed(_divergence(old, new), shape)
+
+
+def summed(log_probs: Tensor, shape: torch.Size) -> Tensor:
+    """Sums of log-probabilities over the parts of each action: ``(*shape, ...)`` to one number."""
+    return log_probs.reshape(*shape, -1).sum(-1, keepdim=True)
+
+
+def _divergence(old: Distribution, new: Distribution) -> Tensor:
     if isinstance(old, Independent) and isinstance(new, Independent):
-        inner, summed = divergence(old.base_dist, new.base_dist), old.reinterpreted_batch_ndims
-        return inner.sum(tuple(range(-summed, 0))) if summed else inner
+        inner, last = _divergence(old.base_dist, new.base_dist), old.reinterpreted_batch_ndims
+        return inner.sum(tuple(range(-last, 0))) if last else inner
     if isinstance(old, Categorical) and isinstance(new, Categorical):
         # PyTorch's has a gradient of NaN where a mask excludes an action from both.
         gap = torch.where(new.probs > 0, old.logits - new.logits, math.inf)

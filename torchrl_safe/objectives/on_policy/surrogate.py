@@ -50,6 +50,7 @@ class CostSurrogate(ConstrainedPPO):
     """PPO's losses, and a penalty on the mean surrogates of the costs."""
 
     cost_buffers = ("cost_violation",)
+    keeps_cost_unit = True
     policy_out_keys = ("loss_penalty",)
 
     def __init__(self, *args: Any, episode_length: float | None = None, **kwargs: Any) -> None:
@@ -90,11 +91,12 @@ class CostSurrogate(ConstrainedPPO):
         """Mean of :func:`clipped_cost_surrogate` for each cost, shape ``(k,)``."""
         low = self.clip_epsilon_low if self._asymmetric else self.clip_epsilon
         high = self.clip_epsilon_high if self._asymmetric else self.clip_epsilon
+        joint = policy.joint(cost_advantage.shape[:-1])
         surrogate = clipped_cost_surrogate(
-            policy.log_ratio,
+            joint.log_ratio,
             cost_advantage,
             ((-low).log1p(), high.log1p()),
-            0.0 if policy.log_correction is None else policy.log_correction,
+            0.0 if joint.log_correction is None else joint.log_correction,
         )
         return torch.stack([reduced(self, column, tensordict) for column in surrogate.unbind(-1)])
 

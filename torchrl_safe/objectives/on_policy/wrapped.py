@@ -119,6 +119,15 @@ class WrappedLoss(LossModule):
     def loss_mask_key(self, value: NestedKey | Literal["auto"] | None) -> None:
         self.loss_module.loss_mask_key = value
 
+    @property
+    def deterministic_sampling_mode(self) -> Any:
+        """How distributions are sampled in a call of the wrapped loss."""
+        return self.loss_module.deterministic_sampling_mode
+
+    @deterministic_sampling_mode.setter
+    def deterministic_sampling_mode(self, value: Any) -> None:
+        self.loss_module.deterministic_sampling_mode = value
+
     def reset(self) -> None:
         """Resets the wrapped loss."""
         self.loss_module.reset()

@@ -142,7 +142,11 @@ class CostUpdater(abc.ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the updater; the buffer is in the state of the loss."""
-        return {"cost_limit": self.cost_limit.clone(), "pessimism": self.pessimism}
+        return {
+            "cost_limit": self.cost_limit.clone(),
+            "pessimism": self.pessimism,
+            "cost_names": list(self.cost_names) if self._has_names else None,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads a state that :meth:`state_dict` returned, with its limits and options.
@@ -151,7 +155,8 @@ class CostUpdater(abc.ABC):
         another limit, set ``cost_limit`` afterwards.
 
         Raises:
-            ValueError: if the state is of another kind of updater or another number of costs.
+            ValueError: if the state is of another kind of updater, another number of costs, or
+                costs of other names or in another order.
         """
         self._check_state(state_dict)
         # Not by a subclass: its options are still those from before the state.
@@ -169,6 +174,9 @@ class CostUpdater(abc.ABC):
                 f"The state has {len(state_dict['cost_limit'])} cost limits, this updater "
                 f"{len(self.cost_limit)}."
             )
+        names = state_dict["cost_names"]
+        if self._has_names and names is not None and tuple(names) != self.cost_names:
+            raise ValueError(f"The state has the costs {names}, this updater {self.cost_names}.")
 
 
 def check_names(cost_names: Sequence[str] | None, num_costs: int) -> tuple[str, ...]:

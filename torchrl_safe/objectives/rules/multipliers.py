@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -113,7 +114,8 @@ class MultiplierUpdater(CostUpdater):
         projected = proposal.clamp(0, self.max_multiplier)
         if projected.shape != buffer.shape or not projected.isfinite().all():
             raise ValueError(
-                f"next_multiplier must return {len(buffer)} finite numbers, got {proposal}."
+                f"next_multiplier must return {len(buffer)} finite numbers, got {proposal} for a "
+                f"violation of {violation}."
             )
         buffer.copy_(projected)
         self.cost_scale = cost_scale
@@ -239,6 +241,14 @@ class DualAscent(MultiplierUpdater):
         self.parametrization = parametrization
         self._parameter = torch.zeros_like(multiplier)
         self.optimizer = optimizer([self._parameter], lr=lr)
+
+    def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
+        before = copy.deepcopy(self.optimizer.state_dict())
+        try:
+            super()._move(buffer, episode_cost)
+        except ValueError:
+            self.optimizer.load_state_dict(before)
+            raise
 
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
         # The buffer is the only home of the multiplier: the parameter is read from it each time,

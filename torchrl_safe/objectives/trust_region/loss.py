@@ -106,7 +106,8 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
                 log-probability and ``cost_advantage``.
 
         Returns:
-            One surrogate for each cost, shape ``(k,)``, in the unit of the cost.
+            One surrogate for each cost, shape ``(k,)``, in the unit of the cost advantages: that of
+            the cost with ``normalize_cost_advantage=False``.
 
         Raises:
             KeyError: if there is no ``cost_advantage``.
@@ -114,7 +115,8 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
         """
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
         self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
-        ratio = self.evaluate(tensordict.clone(False)).ratio()
+        policy = self.evaluate(tensordict.clone(False))
+        ratio = policy.joint(cost_advantage.shape[:-1]).ratio()
         surrogates = (ratio * cost_advantage).split(1, -1)
         return torch.stack([reduced(self, surrogate, tensordict) for surrogate in surrogates])
 

@@ -249,14 +249,14 @@ class TrustRegionStep:
         shape = batch.advantage.shape[:-1]
         distribution = actor.distribution(batch.data)
         weight = importance_weight(self.loss_module, distribution, batch.data, shape)
-        loss = -self._mean(weight * _like(batch.advantage, weight), batch)
+        loss = -self._mean(weight * batch.advantage, batch)
         if self.loss_module.entropy_bonus:
             # TorchRL's, of any distribution; it has no public way to that of a given one.
             entropy = self.loss_module._get_entropy(distribution, shape)
             loss = loss + self._mean(self.loss_module._weighted_loss_entropy(entropy), batch)
         cost = torch.zeros_like(loss)
         if batch.cost_advantage is not None:
-            cost = self._mean(weight * _like(batch.cost_advantage, weight), batch)
+            cost = self._mean(weight * batch.cost_advantage, batch)
         return _Evaluation(distribution, loss, cost)
 
     def _mean(self, values: Tensor, batch: _Batch) -> Tensor:
@@ -264,7 +264,7 @@ class TrustRegionStep:
         return reduced(self.loss_module, values, batch.data)
 
     def _mean_kl(self, fixed: Distribution, distribution: Distribution, batch: _Batch) -> Tensor:
-        return self._mean(divergence(fixed, distribution).unsqueeze(-1), batch)
+        return self._mean(divergence(fixed, distribution, batch.advantage.shape[:-1]), batch)
 
     def _local_problem(
         self, actor: ActorCopy, batch: _Batch, start: _Evaluation, fixed: Distribution
@@ -350,12 +350,6 @@ class TrustRegionStep:
 
 _NUMBERS = ("kl", "surrogate_gain", "cost_surrogate_change", "step_fraction", "constraint_active")
 _COUNTS = ("rejected_steps", "indefinite_steps", "recovery_steps")
-
-
-def _like(advantage: Tensor, weight: Tensor) -> Tensor:
-    """The advantage of each state, repeated for the parts of its action."""
-    *batch, one = advantage.shape
-    return advantage.reshape(*batch, *[1] * (weight.ndim - advantage.ndim), one)
 
 
 def _checked_gradient(name: str, surrogate: Tensor, actor: ActorCopy) -> Tensor:
