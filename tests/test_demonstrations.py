@@ -105,7 +105,7 @@ def test_critics_are_fitted_and_the_policy_stays():
 
     first = error()
     fit_critics(training.loss, played, 5e-3)
-    assert error() < 0.5 * first
+    assert error() < 0.7 * first
     assert all(map(torch.equal, before, training.actor.parameters()))
     assert all(parameter.grad is None for parameter in training.actor.parameters())
 
