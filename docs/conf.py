@@ -29,6 +29,7 @@ extensions = [
     "mathml",
     "names",
     "tables",
+    "tutorials",
 ]
 autosummary_generate = False  # The pages of reference/ are written by hand.
 autodoc_inherit_docstrings = False  # TorchRL and Gymnasium document their own.
