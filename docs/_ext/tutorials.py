@@ -1,4 +1,4 @@
-"""Links to the file of a tutorial become links to its page: they work on the site and in a clone."""
+"""Links to the file of a tutorial become links to its page: they work in a clone as well."""
 
 from __future__ import annotations
 
