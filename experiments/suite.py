@@ -25,7 +25,7 @@ from experiments.config import (
 )
 from experiments.gallery import WITH_PERSON
 from experiments.grid import check_grid, run_grid, save_results
-from experiments.suite_report import plot_profiles, plot_training, report
+from experiments.suite_report import draw
 from torchrl_safe.envs import SUITE
 
 
@@ -110,10 +110,7 @@ def main(config: Config) -> None:
         {"task": settings.suite_task, "algorithm": algorithm, "seed": settings.seed, **result}
         for (settings, algorithm, _), result in zip(grid.values(), results, strict=True)
     ]
-    limits = {run["task"]: dict(SUITE[run["task"]].cost_limits) for run in runs}
-    save_results(config.out, config, runs, report(runs, limits))
-    plot_profiles(runs, limits, config.out / "profiles.png")
-    plot_training(runs, limits, config.out / "training.png")
+    save_results(config.out, config, runs, draw(runs, config.out))
     draw_scenes(config)
 
 

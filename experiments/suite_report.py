@@ -21,12 +21,21 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.style import colour, figure_style, label, limit_line
+from torchrl_safe.envs import SUITE
 from torchrl_safe.metrics import Estimate, interquartile_mean, mean
 
 Run = Mapping[str, Any]
 Limits = Mapping[str, Mapping[str, float]]
 
 _DRAWS = 2000
+
+
+def draw(runs: Sequence[Run], out: Path) -> str:
+    """Draws ``profiles.png`` and ``training.png``, and returns the table."""
+    limits = {run["task"]: SUITE[run["task"]].cost_limits for run in runs}
+    plot_profiles(runs, limits, out / "profiles.png")
+    plot_training(runs, limits, out / "training.png")
+    return report(runs, limits)
 
 
 def report(runs: Sequence[Run], limits: Limits) -> str:

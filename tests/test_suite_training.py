@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import evaluate, suite, train
+from experiments import evaluate, suite, suite_merge, train
 from experiments.config import Config, command_line, suite_config
 from experiments.grid import missing
 from experiments.log import score
@@ -280,6 +280,28 @@ def test_a_finished_suite_runs_nothing_and_writes_all(tmp_path, monkeypatch, cap
     for name in ("profiles", "training", f"pictures/{NAME}"):
         with Image.open(tmp_path / f"{name}.png") as image:
             assert image.width >= 400
+
+
+def test_suites_of_several_places_are_merged(tmp_path, capsys):
+    """A run that is in both counts as it is in the last; only what is drawn is kept."""
+    costs = {"collision": 0.1, "separation": 0.2}
+    first = [made_up(NAME, name, 0, 1.0, **costs) for name in ("ppo", "ppo-lagrangian")]
+    second = [made_up(NAME, "ppo", 0, 0.5, **costs), made_up(NAME, "ppo", 1, 0.7, **costs)]
+    second[1]["history"][1]["return"] = 3.0
+    files = [tmp_path / name for name in ("one.json", "two.json")]
+    for file, runs in zip(files, (first, second), strict=True):
+        file.write_text(json.dumps({"runs": [{**run, "episodes": {}} for run in runs]}))
+    suite_merge.main(suite_merge.Config((*files,), tmp_path / "all"))
+    results = json.loads((tmp_path / "all" / "results.json").read_text())["runs"]
+    del second[1]["history"][1]["return"]
+    assert results == [*second, first[1]]
+    text = (tmp_path / "all" / "table.md").read_text()
+    assert f"| {NAME} | ppo | 60.0% | 50.0% | collision | 0.5 | 0.10 |" in text
+    assert text in capsys.readouterr().out
+    again = suite_merge.Config((tmp_path / "all" / "results.json",), tmp_path / "again")
+    suite_merge.main(again)
+    for name in ("results.json", "table.md"):
+        assert (again.out / name).read_text() == (tmp_path / "all" / name).read_text()
 
 
 def test_results_of_another_definition_are_refused(tmp_path):
