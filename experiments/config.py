@@ -144,8 +144,8 @@ class Config:
     minibatch: int = 256
     """Control steps in a minibatch."""
     learning_rate: float = 5e-4
-    """Adam's learning rate of the policy at the start, half that of the critics; both fall
-    linearly to 0. Off policy, all networks have twice that rate throughout."""
+    """Adam's learning rate of the policy at the start, half that of the critics. Off policy, all
+    networks have twice that rate. Rates fall linearly to 0."""
     episode_steps: int | None = None
     """Control steps after which a training episode is cut off; by default the limit of the
     environment, to which evaluations always play."""
