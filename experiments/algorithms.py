@@ -79,7 +79,7 @@ class Training:
 
 
 def _limits(config: Config) -> dict[str, Any]:
-    return {"cost_limit": config.cost_limits, "cost_names": tuple(config.cost_limits)}
+    return {"cost_limit": config.aims, "cost_names": tuple(config.aims)}
 
 
 def keep_multiplier(loss: LossModule, config: Config) -> None:
@@ -261,7 +261,7 @@ def _of_ppo(make: Callable[..., LossModule]) -> Any:
 
 
 def _budgets(config: Config) -> torch.Tensor:
-    return torch.tensor([*config.cost_limits.values()])
+    return torch.tensor([*config.aims.values()])
 
 
 def _with_budget(config: Config) -> list[Transform]:

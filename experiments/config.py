@@ -164,6 +164,9 @@ class Config:
     """Multiplier to start with."""
     multiplier_rate: float = 0.2
     """What a batch far above its limit adds to the multiplier."""
+    limit_share: float = 1.0
+    """Share of each limit that training aims at; reports have the whole limit. Less than 1 leaves a
+    margin, since a policy may cost more without its noise, and in another engine."""
     pessimism: float = 2.0
     """Standard errors added to the mean cost of a batch: twice as many with cpo and pcpo, none
     with p3o and ipo."""
@@ -184,6 +187,10 @@ class Config:
         for name in ("cost_limit", "multiplier_init", "pessimism"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
+        if not 0 < self.limit_share <= 1:
+            raise ValueError(
+                f"limit_share must be more than 0 and at most 1, got {self.limit_share}."
+            )
         if not 0 < self.gamma < 1:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
         for name in ("demonstrations", "seed"):
@@ -265,6 +272,11 @@ class Config:
         return chosen or {"collision": self.cost_limit}
 
     @property
+    def aims(self) -> dict[str, float]:
+        """What training takes for the limits: ``limit_share`` of each."""
+        return {name: self.limit_share * limit for name, limit in self.cost_limits.items()}
+
+    @property
     def chosen(self) -> tuple[AlgorithmName, ...]:
         """What to train: ``algorithms``, and what ``shield`` adds."""
         more = self.shield and "ppo-shield" not in self.algorithms
@@ -337,7 +349,9 @@ GROUPS = {
         *("frames_per_batch", "epochs", "minibatch", "learning_rate", "gamma", "hidden"),
         *("first_log_std", "last_log_std", "episode_steps", "demonstrations", "care"),
     ),
-    "The multiplier": ("multiplier_rule", "multiplier_init", "multiplier_rate", "pessimism"),
+    "The multiplier": (
+        *("multiplier_rule", "multiplier_init", "multiplier_rate", "limit_share", "pessimism"),
+    ),
 }
 _MORE = (
     "Values shown are the defaults. --help-all says more about each option, with all choices.\n"

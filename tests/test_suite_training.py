@@ -92,6 +92,17 @@ def test_every_limit_reaches_the_updater():
     env.close()
 
 
+def test_a_share_of_each_limit_is_what_training_aims_at():
+    """Updaters and budgets have the share, reports the limit."""
+    config = suite_config("iiwa-reach-joints", physics="mujoco", limit_share=0.5)
+    env = train.make_env(config, 2, 0, "ppo-saute", training=True)
+    (transform,) = (each for each in env.transform if hasattr(each, "budget"))
+    updater = train.ALGORITHMS["ppo-lagrangian"].build(env, config).updater
+    assert updater.cost_limit.tolist() == transform.budget.tolist() == [0.125, 0.25, 0.25]
+    assert config.cost_limits == {"collision": 0.25, "joint-limit": 0.5, "speed": 0.5}
+    env.close()
+
+
 @pytest.mark.parametrize("algorithm", ["ppo-saute", "ppo-early-termination"])
 def test_every_limit_is_a_budget(algorithm):
     config = suite_config(NAME, physics="mujoco")

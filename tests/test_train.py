@@ -423,6 +423,8 @@ def test_noise_falls_from_batch_to_batch():
         ({"envs": 5, "workers": 2}, "envs must be a multiple of workers, got 5 and 2"),
         ({"envs": 6, "workers": 2}, "frames_per_batch must be a multiple of envs"),
         ({"pessimism": -1.0}, "pessimism must not be negative, got -1.0"),
+        ({"limit_share": 0.0}, "limit_share must be more than 0 and at most 1, got 0.0"),
+        ({"limit_share": 1.1}, "limit_share must be more than 0 and at most 1, got 1.1"),
         ({"multiplier_init": -1.0}, "multiplier_init must not be negative, got -1.0"),
         ({"gamma": 1.0}, "gamma must be between 0 and 1, got 1.0"),
         ({"minibatch": 0}, "minibatch must be at least 1, got 0"),
