@@ -1,6 +1,6 @@
 """Puts suites that were run in several places into one: ``python -m experiments.suite_merge``.
 
-``docs/results/suite.json`` has the runs that docs/suite.md shows. Add runs of yours to them::
+``docs/results/suite.json`` has PPO-Lagrangian's runs of docs/suite.md. Add runs of yours to them::
 
     python -m experiments.suite_merge --results docs/results/suite.json runs/suite/results.json
 """

@@ -81,7 +81,8 @@ class ResumableCollector(Collector):
         super().load_state_dict(state_dict, **kwargs)
         *around, env = _inner_envs(self.env)
         for n, level in enumerate(around):
-            level.load_state_dict(state_dict[f"inner_env_{n}"])
+            if f"inner_env_{n}" in state_dict:
+                level.load_state_dict(state_dict[f"inner_env_{n}"])
         if "carrier" in state_dict:
             env.load_state_dict(state_dict["base_env_state_dict"])
             # The method above has drawn numbers from it for trajectories that begin.
