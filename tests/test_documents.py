@@ -234,7 +234,7 @@ def test_no_block_is_left_out():
 def test_environments(tmp_path):
     """Each block runs by itself and makes real environments."""
     blocks = code_of("docs/environments.md") + code_of("docs/engines.md")
-    assert len(blocks) == 7
+    assert len(blocks) == 6
     script = tmp_path / "environments.py"
     check = "env.reset()\nenv.close()\n"
     script.write_text("\n".join(block + check for block in blocks), encoding="utf-8")
