@@ -72,24 +72,27 @@ def shield_table(runs: Sequence[Run]) -> str:
 
 
 def table(runs: Sequence[Run], limits: Limits) -> str:
-    """Returns a Markdown table with a row for each cost of each task and algorithm."""
-    lines = [
-        "| task | algorithm | success | lowest | cost | limit | mean | worst seed | seeds within "
-        "| summed while training |",
-        "|---" * 10 + "|",
+    """Returns a Markdown table with a row for each cost of each task: its mean in each run.
+
+    Costs above their limits are bold. Runs are in the order of their seeds.
+    """
+    algorithms = _algorithms(runs)
+    heads = [
+        *(f"cost, {name}" for name in algorithms),
+        *(f"success, {name}, %" for name in algorithms),
     ]
-    for task, algorithm in _cells(runs):
-        mine = _select(runs, task, algorithm)
-        success = [run["evaluation"]["success"][0] for run in mine]
-        head = f"| {task} | {algorithm} | {np.mean(success):.1%} | {min(success):.1%} "
+    lines = [f"| task | cost | limit | {' | '.join(heads)} |", "|---" * (3 + len(heads)) + "|"]
+    for task in _tasks(runs):
+        of_task = [_select(runs, task, algorithm) for algorithm in algorithms]
+        success = [", ".join(map(_percent, _each(mine, "success"))) for mine in of_task]
+        head = f"`{task}`"
         for name, limit in limits[task].items():
-            costs = [run["evaluation"][f"cost/{name}"][0] for run in mine]
-            within = sum(cost <= limit for cost in costs)
-            lines.append(
-                f"{head}| {name} | {limit:g} | {np.mean(costs):.2f} | {max(costs):.2f} "
-                f"| {within}/{len(mine)} | {_summed(mine, name):,.0f} |"
-            )
-            head = "| | | | "
+            costs = [
+                ", ".join(_cost(cost, limit) for cost in _each(mine, f"cost/{name}"))
+                for mine in of_task
+            ]
+            lines.append(f"| {head} | {name} | {limit:g} | {' | '.join([*costs, *success])} |")
+            head, success = "", ["" for _ in algorithms]
     return "\n".join(lines)
 
 
@@ -246,6 +249,18 @@ def _select(runs: Sequence[Run], task: str, algorithm: str) -> list[Run]:
 
 def _mean_of(runs: Sequence[Run], part: str, name: str) -> float:
     return float(np.mean([run[part][name][0] for run in runs]))
+
+
+def _each(runs: Sequence[Run], name: str) -> list[float]:
+    return [run["evaluation"][name][0] for run in runs]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}".removesuffix(".0")
+
+
+def _cost(cost: float, limit: float) -> str:
+    return f"**{cost:.2f}**" if cost > limit else f"{cost:.2f}"
 
 
 def _summed(runs: Sequence[Run], name: str) -> float:

@@ -208,15 +208,16 @@ def test_scores_are_success_and_the_largest_cost_in_units_of_its_limit():
     assert excess.tolist() == [[4.0, 2.0], [4.0, 1.0]]
 
 
-def test_table_shows_each_cost_against_its_limit():
-    lines = [cells(line) for line in table(RUNS, LIMITS).splitlines()[2:]]
+def test_table_shows_each_cost_of_each_run_against_its_limit():
+    head, _, *lines = (cells(line) for line in table(RUNS, LIMITS).splitlines())
+    assert head == [
+        "task", "cost", "limit", "cost, ppo", "cost, ppo-lagrangian",
+        "success, ppo, %", "success, ppo-lagrangian, %",
+    ]  # fmt: skip
     assert lines == [
-        ["one", "ppo", "95.0%", "90.0%", "hit", "0.5", "1.50", "2.00", "0/2", "150"],
-        ["one", "ppo-lagrangian", "70.0%", "60.0%", "hit", "0.5", "0.38", "0.50", "2/2", "38"],
-        ["two", "ppo", "100.0%", "100.0%", "hit", "1", "0.50", "1.00", "2/2", "50"],
-        ["", "", "", "", "fast", "2", "5.00", "8.00", "1/2", "500"],
-        ["two", "ppo-lagrangian", "100.0%", "100.0%", "hit", "1", "0.50", "1.00", "2/2", "50"],
-        ["", "", "", "", "fast", "2", "2.00", "3.00", "1/2", "200"],
+        ["`one`", "hit", "0.5", "**2.00**, **1.00**", "0.50, 0.25", "100, 90", "80, 60"],
+        ["`two`", "hit", "1", "1.00, 0.00", "1.00, 0.00", "100, 100", "100, 100"],
+        ["", "fast", "2", "**8.00**, 2.00", "1.00, **3.00**", "", ""],
     ]
 
 
@@ -307,7 +308,7 @@ def test_suites_of_several_places_are_merged(tmp_path, capsys):
     del second[1]["history"][1]["return"]
     assert results == [*second, first[1]]
     text = (tmp_path / "all" / "table.md").read_text()
-    assert f"| {NAME} | ppo | 60.0% | 50.0% | collision | 0.5 | 0.10 |" in text
+    assert f"| `{NAME}` | collision | 0.5 | 0.10, 0.10 | 0.10 | 50, 70 | 100 |" in text
     assert text in capsys.readouterr().out
     again = suite_merge.Config((tmp_path / "all" / "results.json",), tmp_path / "again")
     suite_merge.main(again)
