@@ -8,12 +8,14 @@ import torch
 from on_policy import make_composite
 from tensordict.nn import (
     NormalParamExtractor,
+    ProbabilisticTensorDictSequential,
     TensorDictModule,
     set_composite_lp_aggregate,
 )
 from torch import nn
 from torchrl.modules import (
     ActorValueOperator,
+    GRUModule,
     IndependentNormal,
     ProbabilisticActor,
     ValueOperator,
@@ -229,6 +231,37 @@ def test_advantages_of_heads_are_estimated_from_features_computed_now(make):
     last = batch["next", "cost"] + 0.99 * full["next", "cost_value"] * ~done
     # A truncated step's target is what its own next state is worth.
     torch.testing.assert_close(estimated["cost_value_target"][2, 3], last[2, 3])
+
+
+def test_heads_of_a_recurrent_network_do_not_carry_an_episode_into_the_next():
+    """The next state has the value that it has as a state, unless an episode ends between."""
+    torch.manual_seed(0)
+    cell = GRUModule(
+        input_size=OBSERVATION_SIZE, hidden_size=8, in_key="observation", out_key="hidden"
+    )
+    _, (actor, critic, cost_critic) = make_heads()
+    actor = ProbabilisticTensorDictSequential(cell, *[*actor][1:])
+    loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=2)
+    batch = make_batch(2)
+    batch["observation"][:, 1:] = batch["next", "observation"][:, :-1]
+    done = torch.zeros_like(batch["next", "done"])
+    done[:, 1] = True
+    batch["next", "done"], batch["next", "terminated"] = done, done.clone()
+    starts = torch.zeros_like(done)
+    starts[:, 0] = starts[:, 2] = True
+    batch["is_init"], batch["next", "is_init"] = starts, torch.zeros_like(done)
+    state, before, after = torch.zeros(4, 1, 8), [], []
+    for step in batch.unbind(1):  # As a collector does.
+        before.append(state * ~step["is_init"].unsqueeze(-1))
+        state = cell(step.set("recurrent_state", before[-1]))["next", "recurrent_state"].detach()
+        after.append(state)
+    batch["recurrent_state"] = torch.stack(before, 1)
+    batch["next", "recurrent_state"] = torch.stack(after, 1)
+    estimated = loss.estimate_advantages(batch)
+    for key in ("state_value", "cost_value"):
+        following = estimated["next", key][:, :-1]
+        same = torch.isclose(estimated[key][:, 1:], following, atol=1e-6).all(-1, keepdim=True)
+        assert torch.equal(same, ~done[:, :-1])
 
 
 # tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.

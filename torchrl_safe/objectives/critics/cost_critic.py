@@ -188,8 +188,13 @@ class CostCritic(CostValues):
         if not self._shared_keys:
             return tensordict
         data = tensordict.clone(False)
-        for part in (data, data.get("next")):
-            part.update(self.actor_features(part))
+        sequence = following = data.get("next")
+        starts, starts_next = data.get("is_init", None), following.get("is_init", None)
+        if starts is not None and starts_next is not None:
+            # To a recurrent network an episode begins in "next" too, as in TorchRL's estimators.
+            sequence = following.clone(False).set("is_init", starts | starts_next)
+        data.update(self.actor_features(data))
+        following.update(self.actor_features(sequence))
         return data
 
     def _with_ends(self, data: TensorDictBase) -> TensorDictBase:
