@@ -60,6 +60,16 @@ class Forgetful(Counting):
         return {} if self.count == 2 else super().info()
 
 
+class Torque(Counting):
+    """Costs depend on the action, in types that users write: NumPy's bool; 0, or a fraction."""
+
+    def step(self, action):
+        *outcome, info = super().step(action)
+        pushes = action[0] > 0
+        costs = {"pushes": pushes, "torque": float(action[0]) if pushes else 0}
+        return *outcome, {**info, "costs": costs}
+
+
 class WithoutConstructor(gymnasium.Env):
     """Counts to four, without an ``__init__`` of its own."""
 
@@ -70,7 +80,7 @@ class WithoutConstructor(gymnasium.Env):
     reset, info, step = Counting.reset, Counting.info, Counting.step
 
 
-for kind in (Counting, SixTuple, Forgetful, WithoutConstructor):
+for kind in (Counting, SixTuple, Forgetful, Torque, WithoutConstructor):
     gymnasium.register(f"{kind.__name__}-v0", entry_point=f"{__name__}:{kind.__name__}")
 
 

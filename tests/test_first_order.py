@@ -22,7 +22,13 @@ from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch.distributions import Categorical, Independent, Normal, kl_divergence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import MLP, IndependentNormal, MaskedCategorical, ProbabilisticActor
+from torchrl.modules import (
+    MLP,
+    IndependentNormal,
+    MaskedCategorical,
+    ProbabilisticActor,
+    TruncatedNormal,
+)
 from torchrl.objectives import ClipPPOLoss, PPOLoss, SoftUpdate
 
 from torchrl_safe.objectives import (
@@ -520,3 +526,9 @@ def test_the_divergence_of_categories_is_pytorchs():
     everything = torch.distributions.Categorical(probs=torch.ones(3))
     assert divergence(everything, excluding, torch.Size([])) == math.inf
     assert kl_divergence(everything, excluding) == math.inf
+
+
+def test_a_distribution_without_a_divergence_is_named():
+    one = TruncatedNormal(torch.zeros(2), torch.ones(2), low=-1.0, high=1.0)
+    with pytest.raises(NotImplementedError, match="no KL divergence of TruncatedNormal"):
+        divergence(one, one, torch.Size([]))

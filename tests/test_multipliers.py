@@ -471,6 +471,12 @@ def test_a_loss_without_the_buffer_is_refused():
         DualAscent(LossModule(), cost_limit=1.0, lr=0.1)
 
 
+def test_a_compiled_loss_is_moved_itself():
+    loss = make_module(0.0)
+    DualAscent(torch.compile(loss), cost_limit=1.0, lr=0.1).step(torch.tensor([[3.0]]))
+    assert loss.lagrange_multiplier.item() == pytest.approx(0.2)
+
+
 def test_anything_but_a_loss_is_refused():
     module = torch.nn.Module()
     module.register_buffer("lagrange_multiplier", torch.zeros(1))

@@ -19,7 +19,7 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import GymEnv, ObservationNorm
+from torchrl.envs import GymEnv, ObservationNorm, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
     MLP,
@@ -227,6 +227,8 @@ def test_pictures(tmp_path):
     np.testing.assert_allclose(policy(pixels), expected, rtol=1e-4, atol=1e-6)
     with pytest.raises(ValueError, match="observation must have dtype uint8, got float64"):
         policy(pixels / 255)
+    with pytest.raises(ValueError, match=r"observation must have dtype torch.uint8, got torch.flo"):
+        policy.actor.module(torch.from_numpy(pixels / 255))
 
 
 # ---------------------------------------------------------------- in a control loop
@@ -291,6 +293,11 @@ def test_the_policy_in_an_environment(policy, make_env):
     by_hand = policy(played["observation"].flatten(0, 1).numpy())
     np.testing.assert_allclose(played["action"].flatten(0, 1), by_hand, rtol=1e-5, atol=1e-6)
     assert not played["action"].requires_grad
+    single, double = (
+        policy.actor.module(played["observation"].to(dtype))
+        for dtype in (torch.float32, torch.float64)
+    )
+    assert torch.equal(double, single)
     sent = pickle.loads(pickle.dumps(policy.actor))
     again = env.rollout(1, sent, auto_reset=False, tensordict=played[:, 0].select("observation"))
     assert torch.equal(again["action"], played["action"][:, :1])
@@ -328,6 +335,24 @@ def attached():
     net = mlp()
     net.source = (line for line in ())
     return deterministic(net)
+
+
+def test_a_transform_that_an_environment_uses_is_saved_as_a_clone(tmp_path):
+    with pytest.raises(ValueError, match=r"copied: .* put a clone\(\) into the actor"):
+        save_policy(tmp_path / "policy.pt", attached(), SPEC)
+    norm = ObservationNorm(0.5, 2.0, in_keys=["observation"])
+    env = TransformedEnv(ArmEnv(num_envs=2), norm)
+    actor = deterministic(mlp())
+    save_policy(
+        tmp_path / "policy.pt",
+        TensorDictSequential(env.transform.clone(), actor),
+        env.observation_spec_unbatched,
+    )
+    raw = env.base_env.reset()
+    action = load_policy(tmp_path / "policy.pt")(raw["observation"].numpy())
+    expected = actor(norm(raw))["action"].detach()
+    np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-6)
+    env.close()
 
 
 def broken():

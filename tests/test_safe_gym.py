@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from counting import Counting, Forgetful
+from counting import Counting, Forgetful, Torque
 from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from torchrl.collectors import Collector
@@ -363,6 +363,37 @@ def test_cost_must_be_a_number(make_env):
 def test_kinds_of_numbers(make_env, kind):
     env = make_env(SafeGymWrapper, Returns(kind(1)))
     assert env.rollout(2)["next", "cost"].tolist() == [[1.0], [1.0]]
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_rows_may_report_costs_of_other_types(make_env, forked_workers, asynchronous):
+    """Gymnasium gives the array of a cost the type that it has in the first environment."""
+    env = make_env(
+        SafeGymEnv,
+        "counting:Torque-v0",
+        cost_keys=[("costs", "pushes"), ("costs", "torque")],
+        num_envs=2,
+        asynchronous=asynchronous,
+    )
+    after = env.step(env.reset().set("action", torch.tensor([[-0.5], [0.5]])))
+    assert after["next", "cost"].tolist() == [[0, 0], [1, 0.5]]
+
+
+@by_mode
+def test_numpys_bools_are_costs(make_env, mode):
+    made = vector(mode, Torque, Torque)
+    env = make_env(SafeGymWrapper, made, cost_keys=[("costs", "pushes")])
+    after = env.step(env.reset().set("action", torch.tensor([[-0.5], [0.5]])))
+    assert after["next", "cost"].tolist() == [[0], [1]]
+
+
+def test_a_name_and_an_environment_are_told_apart():
+    with pytest.raises(
+        TypeError, match=r"env_name must be a registered name, got <counting.Counting"
+    ):
+        SafeGymEnv(Counting())
+    with pytest.raises(TypeError, match=r"env must be an environment, got 'counting:Counting-v0'"):
+        SafeGymWrapper("counting:Counting-v0")
 
 
 @pytest.mark.parametrize("keys", ["cost", []], ids=repr)

@@ -72,7 +72,7 @@ class Policy:
         self.observation_dtype = example.numpy().dtype
         tensors = {_ACTOR + name: weight for name, weight in self.weights.items()}
         program = Program(contents["steps"], {**tensors, **contents["constants"]})
-        function = _AnyBatch(program, self.observation_shape)
+        function = _AnyBatch(program, self.observation_shape, example.dtype)
         self.actor = TensorDictModule(function, [self.observation_key], [self.action_key])
         with torch.no_grad():
             action = function(example)
@@ -144,8 +144,9 @@ def save_policy(
     The file holds the deterministic policy, in evaluation mode. :func:`torch.export.export` records
     it, so that :func:`load_policy` needs no code of yours, whatever networks and distributions the
     actor is made of. Transforms of the environment are not part of the actor: to save a
-    normalization with it, put it in front, ``TensorDictSequential(normalization, actor)``. Of a
-    :class:`~torchrl.envs.VecNormV2` that is its ``to_observation_norm()``.
+    normalization with it, put it in front, ``TensorDictSequential(normalization.clone(), actor)``
+    (without ``clone``, a transform brings its environment along). Of a
+    :class:`~torchrl.envs.VecNormV2`, put ``to_observation_norm()`` there.
 
     The file is written all at once. If saving fails, the file that was there stays.
 
@@ -204,7 +205,10 @@ def save_policy(
     try:
         actor = copy.deepcopy(actor).cpu().eval()
     except Exception as error:  # Whatever the actor's own parts raise.
-        raise ValueError(f"actor cannot be copied: {error}") from error
+        raise ValueError(
+            f"actor cannot be copied: {error}. Of a transform that an environment uses, put a "
+            "clone() into the actor."
+        ) from error
     weights = {name: _own(value) for name, value in actor.state_dict().items()}
     function = _Deterministic(actor, observation_key, action_key)
     # Leave the caller's random numbers alone.
@@ -370,14 +374,17 @@ class _Deterministic(torch.nn.Module):
 class _AnyBatch(torch.nn.Module):
     """A program for rows as one for any number of batch dimensions, on any device."""
 
-    def __init__(self, program: Program, shape: tuple[int, ...]) -> None:
+    def __init__(self, program: Program, shape: tuple[int, ...], dtype: torch.dtype) -> None:
         super().__init__()
-        self.program, self.shape = program, shape
+        self.program, self.shape, self.dtype = program, shape, dtype
 
     def forward(self, observation: Tensor) -> Tensor:
         dims = max(0, observation.dim() - len(self.shape))
         batch, given = observation.shape[:dims], tuple(observation.shape[dims:])
         if given != self.shape:
             raise ValueError(f"observation must end in shape {self.shape}, got {given}.")
-        action = self.program(observation.reshape((batch.numel(), *self.shape)).cpu())
+        if not torch.can_cast(observation.dtype, self.dtype):
+            raise ValueError(f"observation must have dtype {self.dtype}, got {observation.dtype}.")
+        rows = observation.reshape((batch.numel(), *self.shape))
+        action = self.program(rows.to("cpu", self.dtype))
         return action.reshape((*batch, *action.shape[1:])).to(observation.device)

@@ -176,6 +176,8 @@ class _CostBesideReward(GymWrapper):
         if isinstance(value, Mapping):
             entries = [(*path, key) for key in value]
             raise ValueError(f"{name} must be a number, got a group: name its entries, {entries}.")
+        if isinstance(value, np.ndarray) and value.dtype == object:
+            value = value.tolist()  # Gymnasium puts NumPy's bools and tensors into such an array.
         return check_array(name, value, self._cost.shape[:-1])
 
 
@@ -206,6 +208,41 @@ def _look_up(info: Any, path: tuple[str, ...]) -> Any:
     return entry
 
 
+class _FloatCosts(gymnasium.Wrapper):
+    """Makes each cost of an environment a float.
+
+    Gymnasium gives an entry of a vectorized info the type that it has in the first environment. If
+    that is an integer, the others would lose their fractions.
+    """
+
+    def __init__(self, env: gymnasium.Env, paths: Sequence[tuple[str, ...]]) -> None:
+        super().__init__(env)
+        self.paths = paths
+
+    def step(self, action: Any) -> Any:
+        *outputs, info = self.env.step(action)  # Five, or six with a cost.
+        for path in self.paths:
+            info = _with_float(info, path)
+        return (*outputs, info)
+
+
+def _with_float(info: Any, path: tuple[str, ...]) -> Any:
+    """An info in which the entry is a float, if it is there and a number."""
+    if not path:
+        value = np.asarray(info)
+        return float(value) if value.ndim == 0 and value.dtype.kind in "biuf" else info
+    name, *rest = path
+    if not isinstance(info, Mapping) or name not in info:
+        return info
+    return {**info, name: _with_float(info[name], (*rest,))}
+
+
+def _make_with_floats(
+    make: Callable[[], gymnasium.Env], paths: Sequence[tuple[str, ...]]
+) -> gymnasium.Env:
+    return _FloatCosts(make(), paths)
+
+
 class SafeGymWrapper(_CostBesideReward):
     """TorchRL's :class:`~torchrl.envs.GymWrapper` for environments that report costs.
 
@@ -216,8 +253,8 @@ class SafeGymWrapper(_CostBesideReward):
     Vectorized environments may use the autoreset modes that TorchRL supports, ``DISABLED`` and
     ``SAME_STEP``. In both, and in the vectorized environments of Gymnasium 0.28 and
     Safety-Gymnasium, which have no modes, you get the true last observation, reward and cost of an
-    episode. Make each cost a float: Gymnasium gives an entry of a vectorized info the type that it
-    has in the first environment, and fractions are lost if that is an integer.
+    episode. There, make each cost a float: Gymnasium gives an entry of a vectorized info the type
+    that it has in the first environment, and fractions are lost if that is an integer.
 
     Args:
         env (gymnasium.Env or gymnasium.vector.VectorEnv): the environment.
@@ -228,6 +265,7 @@ class SafeGymWrapper(_CostBesideReward):
         **kwargs: arguments of :class:`~torchrl.envs.GymWrapper`.
 
     Raises:
+        TypeError: if ``env`` is a name.
         ValueError: if ``cost_keys`` is empty, or a cost is not a finite number.
         KeyError: if a step does not report a cost.
 
@@ -240,6 +278,8 @@ class SafeGymWrapper(_CostBesideReward):
     """
 
     def __init__(self, env: Any = None, **kwargs: Any) -> None:
+        if isinstance(env, str):
+            raise TypeError(f"env must be an environment, got {env!r}: SafeGymEnv takes a name.")
         super().__init__(env=env, **kwargs)
 
 
@@ -263,6 +303,9 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
             step takes less than about a millisecond. Defaults to ``True``.
         **kwargs: arguments of :class:`~torchrl.envs.GymEnv` and of the environment.
 
+    Raises:
+        TypeError: if ``env_name`` is not a string.
+
     Examples:
         >>> env = SafeGymEnv("torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0")
         >>> rollout = env.rollout(3)
@@ -272,6 +315,11 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
     """
 
     def __init__(self, env_name: str, *, asynchronous: bool = True, **kwargs: Any) -> None:
+        if not isinstance(env_name, str):
+            raise TypeError(
+                f"env_name must be a registered name, got {env_name!r}: SafeGymWrapper takes an "
+                "environment."
+            )
         self._asynchronous = asynchronous
         super().__init__(env_name, **{"backend": "gymnasium", **kwargs})
 
@@ -287,6 +335,7 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
     def _async_env(self, factories: Sequence[Callable[[], gymnasium.Env]]) -> Any:
         # TorchRL calls it for any number of environments, also for those of this process.
         maker = autoreset if self._maker is gymnasium else safety_gymnasium
+        factories = [partial(_make_with_floats, make, self._cost_paths) for make in factories]
         return maker.vector_env(factories, asynchronous=self._asynchronous)
 
 

@@ -116,7 +116,8 @@ class CostCritic(CostValues):
         Steps that the loss leaves out do not count. Those that pad a trajectory, by
         ``("collector", "mask")``, also end it.
 
-        If you call the loss with a batch that has no advantages, it does the same first.
+        Call it on the batch as it was collected. A call of the loss with data without advantages
+        does the same first, which is wrong, without an error, for a minibatch of shuffled steps.
 
         Args:
             tensordict (TensorDictBase): a batch as collectors return it, shape ``(*B, T)``.

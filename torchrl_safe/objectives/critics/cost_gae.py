@@ -143,7 +143,7 @@ class CostGAE(GAE):
             raise ValueError(
                 f"The cost {self.tensor_keys.reward!r} and its value {self.tensor_keys.value!r} "
                 f"must have one column for each constraint, got shapes {tuple(reward.shape)} and "
-                f"{tuple(value.shape)}."
+                f"{tuple(value.shape)}. (A cost that agents share needs a done that they share.)"
             )
         return (
             reward,

@@ -135,7 +135,13 @@ def _divergence(old: Distribution, new: Distribution) -> Tensor:
         # PyTorch's has a gradient of NaN where a mask excludes an action from both.
         gap = torch.where(new.probs > 0, old.logits - new.logits, math.inf)
         return (old.probs * torch.where(old.probs > 0, gap, 0.0)).sum(-1)
-    return kl_divergence(old, new)
+    try:
+        return kl_divergence(old, new)
+    except NotImplementedError as error:
+        raise NotImplementedError(
+            f"PyTorch knows no KL divergence of {type(old).__name__}: choose another distribution, "
+            "for example TanhNormal, or a loss that needs none, such as PPOLagrangianLoss."
+        ) from error
 
 
 def _in_precision(tensor: Tensor, dtype: torch.dtype) -> Tensor:

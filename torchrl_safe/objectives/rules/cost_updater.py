@@ -43,6 +43,7 @@ class CostUpdater(abc.ABC):
         pessimism: float = 0.0,
         cost_names: Sequence[str] | None = None,
     ) -> None:
+        loss_module = getattr(loss_module, "_orig_mod", loss_module)  # What torch.compile wraps.
         if not isinstance(loss_module, LossModule):
             raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
         buffers = dict(loss_module.named_buffers(recurse=False))
