@@ -40,7 +40,8 @@ def policy_of_the_readme() -> Iterator[Path]:
     """Trains with the quickstart's own loop, for one batch, in another process; yields its file."""
     loop = re.findall(r"```python\n(.*?)```", QUICKSTART.read_text(encoding="utf-8"), re.S)[1]
     with tempfile.TemporaryDirectory() as folder:
-        short = loop.replace("total_frames=256_000", "total_frames=2_048")
+        short, changes = re.subn(r"total_frames=[\d_]+", "total_frames=2_048", loop)
+        assert changes == 1
         command = [sys.executable, "-c", short]
         subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
         yield Path(folder, "policy.pt")

@@ -201,8 +201,10 @@ class Config:
                 f"demonstrations must be 0 with joint actions, got {self.demonstrations}: pilots "
                 "say where the tool is to go."
             )
-        if not self.algorithms:
-            raise ValueError("algorithms must name at least one algorithm, got none.")
+        if not self.algorithms or len({*self.algorithms}) < len(self.algorithms):
+            raise ValueError(
+                f"algorithms must name at least one, each once, got {self.algorithms}."
+            )
         for cost, limit in self.costs.items():
             if not 0 <= limit < math.inf:
                 raise ValueError(f"costs must have limits of at least 0, got {limit} for {cost}.")

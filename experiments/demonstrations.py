@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -150,7 +151,7 @@ def standardize(loss: LossModule, seen: Tensor) -> None:
             module.scale.copy_(scale)
 
 
-def fit_critics(loss: LossModule, played: TensorDictBase, rate: float) -> None:
+def fit_critics(loss: Any, played: TensorDictBase, rate: float) -> None:
     """Fits the critics to what the policy has earned and cost; it stays as it is."""
     critics = [each for name, each in loss.named_parameters() if "critic" in name]
     optimizer = torch.optim.Adam(critics, lr=2 * rate, fused=True)
@@ -158,7 +159,8 @@ def fit_critics(loss: LossModule, played: TensorDictBase, rate: float) -> None:
         data = loss.estimate_advantages(played.clone(False)).reshape(-1).exclude("next")
         for _ in range(_PASSES):
             for minibatch in data[torch.randperm(len(data))].split(256):
-                losses = loss(minibatch)
-                (losses["loss_critic"] + losses["loss_cost_critic"]).backward()
+                # Not a call of the loss, in which a KL penalty adapts to a policy that rests.
+                parts = loss.loss_critic(minibatch)[0], loss.loss_cost_critic(minibatch)[0]
+                sum(part.mean() for part in parts).backward()
                 optimizer.step()
                 loss.zero_grad()

@@ -43,7 +43,9 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)
     settings = json.loads((config.run / "results.json").read_text())["config"]
     train.film(
-        TrainConfig(**{**settings, "algorithms": config.algorithms, "out": config.run}),
+        TrainConfig(
+            **{**settings, "algorithms": config.algorithms, "shield": False, "out": config.run}
+        ),
         config.out,
         seed=config.seed,
         episodes=config.episodes,

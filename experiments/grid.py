@@ -8,7 +8,8 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ def check_grid(config: Any, *names: str) -> None:
     """Checks the settings of a grid: ``jobs``, and what it goes through, each thing once."""
     for name in names:
         values = getattr(config, name)
-        # Files are named by six digits of a number.
-        named = {value if isinstance(value, str) else f"{value:g}" for value in values}
+        # Files are named by six digits of a fraction.
+        named = {f"{value:g}" if isinstance(value, float) else str(value) for value in values}
         if not values or len(named) < len(values):
             raise ValueError(f"{name} must name at least one, each once, got {values}.")
     if config.jobs < 1:
@@ -55,9 +56,16 @@ def side_by_side(
     lock = context.RLock()
     with ProcessPoolExecutor(workers, context, initializer=_prepare, initargs=(lock,)) as pool:
         try:
-            running = {pool.submit(run, *each): index for index, each in enumerate(arguments)}
-            for done in as_completed(running):
-                yield running[done], done.result()
+            calls = iter(enumerate(arguments))
+            running: dict[Future[Any], int] = {}
+            # The pool itself would begin one more call than it has workers.
+            while running := running | {
+                pool.submit(run, *each): index
+                for index, each in islice(calls, workers - len(running))
+            }:
+                ended, _ = wait(running, return_when=FIRST_COMPLETED)
+                for call in ended:
+                    yield running.pop(call), call.result()
         except Exception:
             pool.shutdown(cancel_futures=True)
             raise

@@ -121,8 +121,9 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
             axis.set(xlabel="control steps", title=_CURVES[kind] + cost)
             axis.xaxis.set_major_formatter(EngFormatter(sep=""))
             if kind == "cost":
-                axis.set_ylim(bottom=0)
-                limit_line(axis, results["cost_limits"][cost])
+                limit = results["cost_limits"][cost]
+                axis.set_ylim(0, max(axis.get_ylim()[1], 1.15 * limit))
+                limit_line(axis, limit)
             elif kind == "summed":
                 # From none to thousands.
                 cost_axis(axis, "y", max(end[1] for end in ends))

@@ -36,7 +36,7 @@ from experiments.compiling import compiled
 from experiments.files import TO_RESUME, require_new, write_whole
 from experiments.learners import NOT_LEARNT_FROM, Objective, moved_from_here, summed, tell_length
 from experiments.log import Log, figures, versions
-from torchrl_safe.checkpoint import RunCheckpoints
+from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
 from torchrl_safe.envs.gym import SafeGymEnv
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.objectives import (
@@ -439,11 +439,10 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
         "step": learner.step,
         "log": log,
     }
-    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in CHANGEABLE}
     checkpoints = RunCheckpoints(
         config.out / "checkpoints",
         {name: part for name, part in state.items() if part is not None},
-        settings=settings,
+        settings=_lasting(dataclasses.asdict(config)),
     )
     if config.resume:
         checkpoints.load()
@@ -453,7 +452,7 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     collector = make_collector(config, env, agent)
     begin_episodes(config, collector, log.frames)
     with tqdm(total=config.frames, unit="frame", unit_scale=True, disable=not progress) as bar:
-        bar.update(log.frames)
+        bar.initial = bar.n = bar.last_print_n = log.frames  # Not what this process has done.
         for batch in islice(collector, batches - len(log.rows)):
             episodes = batch["next"][batch["next", "done"].squeeze(-1)]
             if updater is not None:
@@ -476,11 +475,24 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     return agent, log
 
 
+def _lasting(settings: dict[str, Any]) -> dict[str, Any]:
+    """Those settings that a run keeps when it is resumed."""
+    return {name: value for name, value in settings.items() if name not in CHANGEABLE}
+
+
+def as_json(config: Config) -> dict[str, Any]:
+    """The settings as a file has them."""
+    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
+
+
 def start(config: Config) -> None:
     """Begins a run, unless its folder has one of this script that is to be resumed."""
     path = config.out / "results.json"
-    if config.resume and path.exists() and "env" in json.loads(path.read_text())["config"]:
-        return
+    if config.resume and path.exists():
+        before = json.loads(path.read_text())["config"]
+        if "env" in before:
+            refuse_other_settings(_lasting(before), _lasting(as_json(config)))
+            return
     require_new(config.out, "There is no run in it to resume." if config.resume else TO_RESUME)
     if config.resume:
         print(f"There is no run in {config.out} to resume: this begins one.")
@@ -494,9 +506,11 @@ def main(config: Config) -> dict[str, Any]:
     agent, log = train(config)
     seconds = log.seconds
     env = make_env(config)
-    kept = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     save_policy(
-        config.out / "policy.pt", agent.actor, env.observation_spec_unbatched, settings=kept
+        config.out / "policy.pt",
+        agent.actor,
+        env.observation_spec_unbatched,
+        settings=as_json(config),
     )
     # The statistics of observations stay as they are.
     episodes = evaluate(env, agent.actor, config.eval_episodes, seed=EVALUATION + config.seed)

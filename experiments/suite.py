@@ -52,6 +52,8 @@ class Config:
 
     def __post_init__(self) -> None:
         check_grid(self, "tasks", "algorithms", "seeds")
+        for task, algorithm in product(self.tasks, self.algorithms):
+            suite_config(task, algorithms=(algorithm,))  # Raises if it cannot be trained there.
         if self.frames is not None and self.frames < 1:
             raise ValueError(f"frames must be at least 1, got {self.frames}.")
         if self.eval_episodes < 2:

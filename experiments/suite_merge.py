@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,20 @@ def merge(results: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     """The runs of several suites, each once and as small as the figures allow.
 
     Ordered by task, algorithm and seed.
+
+    Raises:
+        ValueError: unless every algorithm has run on the same tasks with the same seeds.
     """
     found = {(run["task"], run["algorithm"], run["seed"]): run for runs in results for run in runs}
-    tasks, algorithms = [*SUITE], [*dict.fromkeys(algorithm for _, algorithm, _ in found)]
+    tasks = [task for task in SUITE if any(task == known for known, *_ in found)]
+    algorithms = [*dict.fromkeys(algorithm for _, algorithm, _ in found)]
+    seeds = {seed for *_, seed in found}
+    if absent := [key for key in product(tasks, algorithms, seeds) if key not in found]:
+        shown = "; ".join(" ".join(map(str, key)) for key in absent[:5])
+        raise ValueError(
+            f"results must have every algorithm on the same tasks and seeds, got none of {shown}"
+            f"{' ...' if len(absent) > 5 else ''}."
+        )
     order = sorted(found, key=lambda key: (tasks.index(key[0]), algorithms.index(key[1]), key[2]))
     return [_essence(found[key]) for key in order]
 
@@ -47,7 +59,7 @@ def _essence(run: dict[str, Any]) -> dict[str, Any]:
         {key: value for key, value in row.items() if key == "frames" or key.startswith("summed/")}
         for row in run["history"]
     ]
-    kept = ("task", "algorithm", "seed", "evaluation", "versions")
+    kept = ("task", "algorithm", "seed", "evaluation", "without_shield", "versions")
     return {**{name: run[name] for name in kept if name in run}, "history": history}
 
 

@@ -259,7 +259,7 @@ def train(
             demonstrate(config, algorithm, training)
             collector.update_policy_weights_()
         log.open()
-        bar.update(log.frames)
+        bar.initial = bar.n = bar.last_print_n = log.frames  # Not what this process has done.
         for batch in islice(collector, batches - len(log.rows)):
             episodes = batch["next"][batch["next", "done"].squeeze(-1)]
             if training.updater is not None:
@@ -416,6 +416,8 @@ def finish(
 
 def main(config: Config) -> None:
     """Trains and evaluates each algorithm, then writes the comparison."""
+    for name in config.chosen:
+        configured(config, name)  # Raises if what it sets does not fit, before anything is trained.
     results = start(config)
     todo = [name for name in config.chosen if name not in results["algorithms"]]
     for name in todo:

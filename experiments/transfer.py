@@ -22,6 +22,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from experiments import train
+from experiments.algorithms import ALGORITHMS, no_transforms
 from experiments.grid import check_grid, run_grid, save_results
 from torchrl_safe.envs import (
     SUITE,
@@ -32,6 +33,7 @@ from torchrl_safe.envs import (
     Placement,
     Scene,
     Shape,
+    Shield,
     SuiteTask,
 )
 from torchrl_safe.evaluation import evaluate, summarize
@@ -185,7 +187,13 @@ def applies(task: SuiteTask, condition: Condition) -> bool:
 
 
 def make_env(
-    task: SuiteTask, condition: Condition, *, physics: str, num_envs: int, seed: int
+    task: SuiteTask,
+    condition: Condition,
+    *,
+    physics: str,
+    num_envs: int,
+    seed: int,
+    shield: Shield | None = None,
 ) -> EnvBase:
     """Makes the environment of a task under a condition.
 
@@ -195,9 +203,10 @@ def make_env(
         physics: the engine of the training.
         num_envs: worlds.
         seed: seed of the noise.
+        shield: filters the actions, if given.
     """
     scene = _SCENES.get(condition, Scene())
-    settings: dict[str, Any] = {"num_envs": num_envs, "scene": scene}
+    settings: dict[str, Any] = {"num_envs": num_envs, "scene": scene, "shield": shield}
     match condition:
         case "other engine":
             physics = "bullet" if physics == "mujoco" else "mujoco"
@@ -218,12 +227,21 @@ def run(policy: str, condition: Condition, episodes: int, seed: int) -> dict[str
     """Plays with a policy under a condition; returns its task and its figures."""
     torch.set_num_threads(1)
     saved = load_policy(policy)
-    name = saved.settings["suite_task"]
+    name = saved.settings.get("suite_task")
+    if name is None:
+        raise ValueError(f"policies must be of tasks of the suite, got {policy!r}.")
+    algorithm = ALGORITHMS[saved.settings["name"]]
+    if algorithm.transforms is not no_transforms:
+        raise ValueError(
+            f"policies must observe what the task has, got {policy!r} of {saved.settings['name']}."
+        )
     task = SUITE[name]
     if not applies(task, condition):
         return {"task": name, "evaluation": None}
     physics = saved.settings["physics"]
-    env = make_env(task, condition, physics=physics, num_envs=32, seed=seed)
+    env = make_env(
+        task, condition, physics=physics, num_envs=32, seed=seed, shield=algorithm.shield
+    )
     try:
         played = evaluate(env, saved.actor, episodes, seed=seed)
     finally:
@@ -256,6 +274,12 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def name_of(policy: str) -> str:
+    """What a policy is called: its file, or the folders of one that training has written."""
+    path = Path(policy)
+    return "-".join(path.parts[-4:-1]) if path.name == "policy.pt" else path.stem
+
+
 def _exceeded(figures: Mapping[str, Any], limits: Mapping[str, float]) -> list[str]:
     return [name for name, limit in limits.items() if figures[f"cost/{name}"][0] > limit]
 
@@ -273,7 +297,7 @@ def main(config: Config) -> None:
     """Plays what is missing, then writes the table and results.json."""
     cases = list(product(config.chosen, config.conditions))
     jobs = {
-        config.out / f"{Path(policy).stem}-{condition.replace(' ', '-')}.json": (
+        config.out / f"{name_of(policy)}-{condition.replace(' ', '-')}.json": (
             policy,
             condition,
             config.episodes,
@@ -285,7 +309,7 @@ def main(config: Config) -> None:
         raise ValueError(f"policies must have different names, got {config.chosen}.")
     results = run_grid(run, jobs, workers=config.jobs, name="transfer")
     runs = [
-        {"policy": Path(policy).stem, "condition": condition, **result}
+        {"policy": name_of(policy), "condition": condition, **result}
         for (policy, condition), result in zip(cases, results, strict=True)
     ]
     save_results(config.out, config, runs, table(runs))

@@ -110,6 +110,15 @@ def test_critics_are_fitted_and_the_policy_stays():
     assert all(parameter.grad is None for parameter in training.actor.parameters())
 
 
+def test_the_penalty_of_a_loss_does_not_adapt_to_a_policy_that_rests():
+    training, env, _ = make_training("kl-ppo-lagrangian")
+    played = Stage(env).play(10, training.actor)
+    env.close()
+    before = training.loss.beta.clone()
+    fit_critics(training.loss, played, 2e-3)
+    assert torch.equal(training.loss.beta, before)
+
+
 def test_every_algorithm_starts_from_the_same_policy():
     weights = []
     for algorithm in ("ppo-lagrangian", "cpo"):

@@ -51,6 +51,20 @@ def test_a_job_that_fails_leaves_the_others(tmp_path):
     assert kept["result"] == {"square": 4}
 
 
+def fail_first(folder, number):
+    (folder / f"began-{number}").touch()
+    time.sleep(0.1)
+    if number == 0:
+        raise ArithmeticError(number)
+
+
+def test_after_a_call_that_fails_no_other_begins(tmp_path):
+    calls = [(tmp_path, number) for number in range(4)]
+    with pytest.raises(ArithmeticError):
+        list(side_by_side(fail_first, calls, workers=1))
+    assert [path.name for path in tmp_path.iterdir()] == ["began-0"]
+
+
 def sleep(folder, number):
     (folder / f"{number}-{os.getpid()}").touch()
     time.sleep(600)

@@ -159,6 +159,16 @@ def test_resuming_where_no_run_is_says_so(tmp_path, capsys):
     assert said not in capsys.readouterr().out
 
 
+def test_resuming_with_other_settings_is_refused_before_there_is_a_checkpoint(tmp_path):
+    config = replace(SMALL, out=tmp_path)
+    safe_gym.start(config)
+    safe_gym.start(replace(config, resume=True, eval_episodes=8))
+    with pytest.raises(
+        ValueError, match=r"the run has other settings: gamma was .* and is now 0.5"
+    ):
+        safe_gym.start(replace(config, resume=True, gamma=0.5))
+
+
 def test_a_run_of_another_script_is_not_overwritten(tmp_path):
     results = tmp_path / "results.json"
     results.write_text('{"config": {"envs": 32}, "algorithms": {}}')

@@ -298,7 +298,10 @@ def test_suites_of_several_places_are_merged(tmp_path, capsys):
     """A run that is in both counts as it is in the last; only what is drawn is kept."""
     costs = {"collision": 0.1, "separation": 0.2}
     first = [made_up(NAME, name, 0, 1.0, **costs) for name in ("ppo", "ppo-lagrangian")]
-    second = [made_up(NAME, "ppo", 0, 0.5, **costs), made_up(NAME, "ppo", 1, 0.7, **costs)]
+    second = [
+        *(made_up(NAME, "ppo", 0, 0.5, **costs), made_up(NAME, "ppo", 1, 0.7, **costs)),
+        made_up(NAME, "ppo-lagrangian", 1, 1.0, **costs),
+    ]
     second[1]["history"][1]["return"] = 3.0
     files = [tmp_path / name for name in ("one.json", "two.json")]
     for file, runs in zip(files, (first, second), strict=True):
@@ -306,10 +309,15 @@ def test_suites_of_several_places_are_merged(tmp_path, capsys):
     suite_merge.main(suite_merge.Config((*files,), tmp_path / "all"))
     results = json.loads((tmp_path / "all" / "results.json").read_text())["runs"]
     del second[1]["history"][1]["return"]
-    assert results == [*second, first[1]]
+    assert results == [*second[:2], first[1], second[2]]
     text = (tmp_path / "all" / "table.md").read_text()
-    assert f"| `{NAME}` | collision | 0.5 | 0.10, 0.10 | 0.10 | 50, 70 | 100 |" in text
+    assert f"| `{NAME}` | collision | 0.5 | 0.10, 0.10 | 0.10, 0.10 | 50, 70 | 100, 100 |" in text
     assert text in capsys.readouterr().out
+    lacking = tmp_path / "lacking.json"
+    lacking.write_text(json.dumps({"runs": [*first[:1], {**first[1], "seed": 1}]}))
+    with pytest.raises(ValueError, match=rf"got none of {NAME} ppo 1; {NAME} ppo-lagrangian 0\."):
+        suite_merge.main(suite_merge.Config((lacking,), tmp_path / "none"))
+    assert not (tmp_path / "none").exists()
     again = suite_merge.Config((tmp_path / "all" / "results.json",), tmp_path / "again")
     suite_merge.main(again)
     for name in ("results.json", "table.md"):
@@ -331,6 +339,8 @@ def test_results_of_another_definition_are_refused(tmp_path):
     [
         ({"tasks": ()}, r"tasks must name at least one, each once, got \(\)"),
         ({"seeds": (1, 1)}, r"seeds must name at least one, each once, got \(1, 1\)"),
+        ({"algorithms": ("ppo", "cpo")}, "algorithms must not contain cpo with several costs"),
+        ({"algorithms": ("sac-lagrangian",)}, "demonstrations must be 0 with sac-lagrangian"),
         ({"jobs": 0}, "jobs must be at least 1, got 0"),
         ({"frames": 0}, "frames must be at least 1, got 0"),
         ({"eval_episodes": 1}, "eval_episodes must be at least 2, got 1"),

@@ -234,6 +234,17 @@ def test_all_rows_of_learning_curves_are_seen(tmp_path, monkeypatch):
             assert low < 0.5 < 40 < high
 
 
+def test_the_limit_is_in_the_picture_where_costs_are_far_below(tmp_path, monkeypatch):
+    history = [{"frames": n, "return": 0.0, "cost/collision": 0.1} for n in (8, 16)]
+    monkeypatch.setattr(plt, "close", lambda figure: None)
+    runs = {"algorithms": {"ppo": {"history": history}}, "cost_limits": {"collision": 5.0}}
+    plot_curves(runs, tmp_path / "curves.png")
+    axis = plt.gcf().axes[1]
+    monkeypatch.undo()
+    plt.close()
+    assert axis.get_ylim() == (0, 5.75)
+
+
 def test_a_run_without_a_finished_episode_has_empty_curves(tmp_path):
     runs = {"ppo": {"history": [{"frames": 8, "summed/collision": 0.0}]}}
     plot_curves({"algorithms": runs, "cost_limits": {"collision": 0.5}}, tmp_path / "curves.png")
@@ -440,7 +451,8 @@ def test_noise_falls_from_batch_to_batch():
             {"demonstrations": 1, "action": "joint"},
             "demonstrations must be 0 with joint actions, got 1",
         ),
-        ({"algorithms": ()}, "algorithms must name at least one"),
+        ({"algorithms": ()}, r"algorithms must name at least one, each once, got \(\)"),
+        ({"algorithms": ("ppo", "ppo")}, "algorithms must name at least one, each once"),
         ({"algorithms": ("cpo", "td3-lagrangian"), "paper": True}, "not contain td3-lagrangian"),
         ({"algorithms": ("ppo-saute",), "cost_limit": 0.0}, "cost_limit must be positive with ppo"),
         ({"shield": True, "paper": True}, "shield must be False with paper"),

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.modules import MLP
 
 from experiments import transfer
+from experiments.algorithms import ALGORITHMS
 from experiments.config import suite_config
 from experiments.pilots import act, make_pilot
 from torchrl_safe.envs import (
@@ -209,6 +211,29 @@ def test_table_and_folder(tmp_path, capsys):
     assert limits == f"| limits | collision 0.5, separation {LIMIT:g} | |"
     assert as_trained.startswith("| as trained | ")
     assert heavy == "| heavy object |  | 0/0 |"
+
+
+def test_a_shield_that_was_trained_with_is_there(tmp_path, monkeypatch):
+    saved = SimpleNamespace(
+        actor=None, settings={"name": "ppo-shield", "suite_task": NAME, "physics": "mujoco"}
+    )
+    monkeypatch.setattr(transfer, "load_policy", lambda path: saved)
+    monkeypatch.setattr(transfer, "evaluate", lambda env, *args, **kwargs: env.shield)
+    monkeypatch.setattr(transfer, "summarize", lambda shield, names: shield)
+    assert transfer.run("p", "as trained", 2, 0)["evaluation"] == ALGORITHMS["ppo-shield"].shield
+    saved.settings["name"] = "ppo-saute"
+    with pytest.raises(
+        ValueError, match="policies must observe what the task has, got 'p' of ppo-"
+    ):
+        transfer.run("p", "as trained", 2, 0)
+    del saved.settings["suite_task"]
+    with pytest.raises(ValueError, match="policies must be of tasks of the suite, got 'p'"):
+        transfer.run("p", "as trained", 2, 0)
+
+
+def test_policies_that_training_has_written_have_the_names_of_their_folders():
+    assert transfer.name_of("runs/suite/runs/a/3/ppo/policy.pt") == "a-3-ppo"
+    assert transfer.name_of("mine.pt") == transfer.name_of("mine") == "mine"
 
 
 def test_costs_above_their_limits_are_bold():

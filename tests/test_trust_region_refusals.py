@@ -128,7 +128,7 @@ def test_without_any_advantage_nothing_moves_and_nothing_is_refused(method):
     info = step.step(data)
     assert torch.equal(actor_state(loss), before)
     assert info["step_fraction"] == 0
-    assert set(step.state_dict().values()) == {0}
+    assert {**step.state_dict(), "episode_length": 0} == dict.fromkeys(step.state_dict(), 0)
 
 
 def test_without_cost_gradient_cpo_is_trpo():
@@ -268,7 +268,13 @@ def test_state_round_trip():
     step.step(make_data(loss))
     step.method = Fixed(1e6)
     step.step(make_data(loss))
-    assert step.state_dict() == {"rejected_steps": 1, "indefinite_steps": 0, "recovery_steps": 1}
+    step.episode_length = 40.0  # As a training loop may tell it.
+    assert step.state_dict() == {
+        "rejected_steps": 1,
+        "indefinite_steps": 0,
+        "recovery_steps": 1,
+        "episode_length": 40.0,
+    }
 
     resumed_loss = make_loss(seed=5)
     resumed_loss.load_state_dict(loss.state_dict())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -212,13 +212,13 @@ class TrustRegionStep:
                 return self._report()
             return self._search(actor, batch, start, fixed, problem, self.method(problem))
 
-    def state_dict(self) -> dict[str, int]:
-        """Returns the counts; the actor is in the state of the loss."""
-        return {name: getattr(self, name) for name in _COUNTS}
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the counts and ``episode_length``; the actor is in the state of the loss."""
+        return {name: getattr(self, name) for name in (*_COUNTS, "episode_length")}
 
-    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads a state that :meth:`state_dict` returned."""
-        for name in _COUNTS:
+        for name in (*_COUNTS, "episode_length"):
             setattr(self, name, state_dict[name])
 
     @torch.no_grad()
