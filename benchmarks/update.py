@@ -13,12 +13,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives import ClipPPOLoss, LossModule
+from torchrl.objectives import ClipPPOLoss
 
 from benchmarks.handwritten import HandWritten, arguments
 from benchmarks.networks import ACTION, OBSERVATION, make_actor, make_critic, make_minibatch
 from benchmarks.report import Figure
 from benchmarks.timing import Contender, Times, quartiles, race, ratio, timed
+from experiments.learners import summed
 from torchrl_safe.objectives import PPOLagrangianLoss
 
 _OPTIONS: dict[str, Any] = {"entropy_bonus": False, "loss_critic_type": "l2"}
@@ -48,16 +49,6 @@ class Bystander(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, object]]:
         return self.observation_space.sample(), 0.0, False, False, {}
-
-
-def summed(loss: LossModule) -> Callable[[TensorDictBase], Tensor]:
-    """The sum of a loss's terms, as every training loop takes it."""
-
-    def objective(minibatch: TensorDictBase) -> Tensor:
-        losses = loss(minibatch)
-        return sum(value for key, value in losses.items() if key.startswith("loss_"))
-
-    return objective
 
 
 def update(module: nn.Module, objective: Callable[[], Tensor]) -> Callable[[], None]:

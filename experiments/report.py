@@ -73,8 +73,10 @@ def successes(runs: list[dict[str, Any]]) -> list[float]:
 
 
 def mean_over_seeds(costs: torch.Tensor) -> str:
-    """Mean of (seeds, episodes) with its 95 % interval over seeds; of one seed, over episodes."""
-    middle = mean(costs.unsqueeze(-1), resample="seeds" if len(costs) > 1 else "episodes")
+    """Mean of (seeds, episodes) with its 95 % interval over seeds; of one seed the mean alone."""
+    if len(costs) == 1:
+        return f"{costs.mean():.2f}"
+    middle = mean(costs.unsqueeze(-1), resample="seeds")
     return f"{middle.value.item():.2f} [{middle.low.item():.2f}, {middle.high.item():.2f}]"
 
 
