@@ -302,7 +302,13 @@ def test_rotation_vector_takes_the_short_way():
         (lambda: JointDelta(step=float("inf")), "step must be positive and finite, got inf"),
         (lambda: DampedLeastSquares(damping=0), "damping must be positive and finite, got 0"),
         (lambda: Scene(gravity=float("nan")), "gravity must be finite"),
+        (lambda: Scene(gravity=-9.81), "gravity must be finite and not negative, got -9.81"),
         (lambda: Bullet(motor_gain=0), "motor_gain must be positive and finite, got 0"),
+        (lambda: Bullet(motor_gain=5.0), "motor_gain must be at most 1, got 5.0"),
+        (
+            lambda: CartesianDelta(orientation=(1, 0, 0, 0), rotation_step=1),
+            r"give one of them, got \(1, 0, 0, 0\) and 1",
+        ),
         (lambda: CartesianDelta(yaw_step=-1), "yaw_step must be positive and finite, got -1"),
         (lambda: CartesianDelta(yaw_step=1, rotation_step=1), "give one of them, got 1 and 1"),
         (lambda: JointDelta(finger_step=0), "finger_step must be positive and finite, got 0"),

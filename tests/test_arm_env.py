@@ -26,6 +26,7 @@ from torchrl_safe.envs import (
     FullObservation,
     InFront,
     JointDelta,
+    MuJoCo,
     NoObstacles,
     Placement,
     Push,
@@ -635,6 +636,15 @@ def test_render(make_env):
 def test_camera_rejects(arguments, message):
     with pytest.raises(ValueError, match=message):
         Camera(**arguments)
+
+
+@pytest.mark.parametrize("eye", [(0.4, 0.0, 1.5), (12.0, 0.0, 4.0)], ids=["down", "far"])
+@pytest.mark.parametrize("physics", [Bullet(), MuJoCo(threads=1)], ids=["bullet", "mujoco"])
+def test_a_camera_may_look_straight_down_and_from_afar(make_env, eye, physics):
+    env = make_env(ArmEnv, physics=physics)
+    env.reset()
+    picture = env.render(64, 48, Camera(eye=eye, target=(0.4, 0.0, 0.0)))[0]
+    assert len(picture.reshape(-1, 3).unique(dim=0)) > 1  # Not the background alone.
 
 
 def test_render_wants_a_camera(make_env):

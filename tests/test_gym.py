@@ -85,6 +85,13 @@ def test_checkers_of_gymnasium_and_stable_baselines(parts):
     env.close()
 
 
+def test_mujoco_has_no_window_to_offer():
+    env = gymnasium.make("torchrl_safe/PandaReach-v0", physics=MuJoCo(threads=1))
+    assert env.unwrapped.metadata["render_modes"] == ["rgb_array"]
+    check_env(env.unwrapped, skip_render_check=False)
+    env.close()
+
+
 def test_names():
     names = {n.removeprefix("torchrl_safe/") for n in gymnasium.registry if "torchrl_safe" in n}
     assert names >= {

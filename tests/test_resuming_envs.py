@@ -38,6 +38,7 @@ from torchrl_safe.envs import (
     Proximity,
     Push,
     Scattered,
+    Shield,
     paper_env,
 )
 
@@ -161,6 +162,32 @@ def test_a_state_of_other_worlds_is_refused(make_env):
     for other in (make_env(ArmEnv), make_env(ArmEnv, UR5, num_envs=2)):
         with pytest.raises(ValueError, match="state must be of an environment like this one"):
             env.load_state_dict(other.state_dict())
+
+
+def test_a_refused_state_leaves_the_running_episodes(make_env):
+    env, twin = (make_env(ArmEnv, num_envs=2, seed=0) for _ in range(2))
+    actions = torch.rand(10, 2, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    _, td = play(env, actions[:5], env.reset())
+    play(twin, actions[:5], twin.reset())
+    other = make_env(ArmEnv, UR5, num_envs=2)
+    other.reset()
+    with pytest.raises(ValueError, match=r"of an environment like this one|whose"):
+        env.load_state_dict(other.state_dict())
+    assert_equal(play(twin, actions[5:], td.clone())[0], play(env, actions[5:], td.clone())[0])
+
+
+def test_a_state_without_a_shield_is_refused_behind_one(make_env):
+    env = make_env(ArmEnv, num_envs=1, shield=Shield())
+    with pytest.raises(ValueError, match=r"got no \['shield_braked', 'shield_correction'\]"):
+        env.load_state_dict(make_env(ArmEnv, num_envs=1).state_dict())
+
+
+def test_a_state_from_before_the_first_reset_has_no_episode_to_go_on_with(make_env):
+    env, other = make_env(ArmEnv, num_envs=1, seed=3), make_env(ArmEnv, num_envs=1)
+    other.load_state_dict(env.state_dict())
+    with pytest.raises(RuntimeError, match="reset"):
+        other.step(TensorDict({"action": torch.zeros(1, 3)}, [1]))
+    assert torch.equal(other.reset()["observation"], env.reset()["observation"])
 
 
 def test_a_state_that_does_not_come_back_is_told_of(make_env):

@@ -3,6 +3,7 @@
 from dataclasses import asdict
 
 import numpy as np
+import pybullet
 import pytest
 import torch
 from worlds import ARMS, Places, each_arm, home_of, rest, step
@@ -81,6 +82,27 @@ def test_pressing_on_the_table_is_a_touch(make_env, arm):
     # The touch is over with the episode.
     env.reset()
     assert np.isinf(env.arm_state.trace["table_distance"]).all()
+
+
+def test_no_press_on_the_table_is_lost(make_env):
+    """PyBullet's solver holds what it presses together a hair apart."""
+    env = make_env(
+        ArmEnv,
+        obstacles=NoObstacles(),
+        costs={"table": Collision(table=True)},
+        max_episode_steps=300,
+        physics=Bullet(),
+        seed=0,
+    )
+    env.reset()
+    world = env._simulator.worlds[0]  # The force is not among the readings.
+    rng = np.random.default_rng(0)
+    for index in range(60):
+        action = [0, 0, -1] if index < 12 else rng.normal([0, 0, -0.3], [0.7, 0.7, 0.5])
+        cost = step(env, action)["cost"].item()
+        points = pybullet.getContactPoints(world._arm.body, physicsClientId=world._client)
+        pressed = any(point[9] > 0 and point[3] not in world._arm.base for point in points)
+        assert cost or not pressed, index
 
 
 # Actions that, kept up, fold the arm into itself; the Panda's hand then presses on its base.

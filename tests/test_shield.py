@@ -386,6 +386,20 @@ def test_specs(make_env, engine, obstacles):
     assert rollout["shield_correction"].shape == (2, 4, 1)
 
 
+def test_a_reset_does_not_change_what_a_step_has_returned(make_env, engine):
+    """Neither do two flags share their memory."""
+    env = make_env(ArmEnv, num_envs=2, shield=Shield(), max_episode_steps=1, seed=0)
+    env.reset()
+    env._braked[:] = True
+    after = env._pack(**env._shield_keys())
+    env.reset()
+    assert after["shield_braked"].all()
+    last = step(env, torch.zeros(2, 3))
+    kept = last["success"].clone()
+    last["terminated"].logical_not_()
+    assert torch.equal(last["success"], kept)
+
+
 def test_the_batch_holds_the_sampled_action(make_env, engine):
     """And its log-probability. What is executed instead is up to the environment."""
     env = make_env(ArmEnv, num_envs=2, action=JointDelta(), shield=Shield(), seed=0)

@@ -244,6 +244,7 @@ def test_at_the_radius_is_not_within_it(kind):
     [
         ({"radius": 0}, ValueError, "radius must be positive and finite, got 0"),
         ({"distance": np.nan}, ValueError, "distance must be positive and finite, got nan"),
+        ({"radius": 0.5}, ValueError, "distance must be more than radius, 0.5, got 0.3"),
         ({"shape": Box()}, ValueError, r"shape must have a mass to be moved, got Box\("),
         ({"shape": None}, TypeError, "shape must be an instance of Cylinder or Box or"),
         ({"shape": "box"}, TypeError, "shape must be an instance of Cylinder or Box or"),

@@ -85,8 +85,9 @@ class ResumableCollector(Collector):
                 level.load_state_dict(state_dict[f"inner_env_{n}"])
         if "carrier" in state_dict:
             env.load_state_dict(state_dict["base_env_state_dict"])
-            # The method above has drawn numbers from it for trajectories that begin.
-            self._traj_pool.load_state_dict(state_dict["traj_pool"])
+            if "traj_pool" in state_dict:  # The pool of workers is in the state of their parent.
+                # The method above has drawn numbers from it for trajectories that begin.
+                self._traj_pool.load_state_dict(state_dict["traj_pool"])
             self._carrier = TensorDict(
                 state_dict["carrier"],
                 batch_size=self._carrier.batch_size,

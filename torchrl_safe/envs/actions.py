@@ -124,6 +124,11 @@ class CartesianDelta:
                 f"yaw_step is a part of rotation_step: give one of them, got {self.yaw_step} and "
                 f"{self.rotation_step}."
             )
+        if self.orientation is not None and self.rotation_step is not None:
+            raise ValueError(
+                "orientation is what the tool keeps, and rotation_step turns it: give one of them, "
+                f"got {self.orientation} and {self.rotation_step}."
+            )
 
     @property
     def moves_fingers(self) -> bool:

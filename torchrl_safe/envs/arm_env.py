@@ -139,6 +139,8 @@ class ArmEnv(EnvBase):
         check_kind("costs", costs, Mapping)
         if not costs:
             raise ValueError("costs must name at least one cost, got an empty mapping.")
+        if wrong := [name for name in costs if not isinstance(name, str)]:
+            raise TypeError(f"costs must have names that are strings, got {wrong}.")
         named = [(f"cost {name!r}", cost) for name, cost in costs.items()]
         for name, function in [*named, ("observation", observation)]:
             if isinstance(function, type) or not callable(function):
@@ -342,6 +344,7 @@ class ArmEnv(EnvBase):
         arrays = {
             "generators": np.stack([pack(generator) for generator in self._generators]),
             "draws": self._draws,
+            "begun": np.full(self.num_envs, self._begun),
             **({} if self.shield is None else self._shield_state()),
             **{_PHYSICS + name: array for name, array in self._simulator.save().items()},
         }
@@ -351,15 +354,26 @@ class ArmEnv(EnvBase):
         """Brings the running episodes back, as part of ``load_state_dict``.
 
         Raises:
-            ValueError: if the state has another number of worlds, or of numbers in each.
+            ValueError: if the state has another number of worlds, or of numbers in each; the
+                episodes go on then as they were.
         """
         self._check_open()
-        arrays = {name: tensor.numpy().copy() for name, tensor in state.items()}
-        if len(arrays["draws"]) != self.num_envs:
+        own = self.get_extra_state()
+        if absent := sorted(own.keys() - state.keys()):
+            raise ValueError(f"state must be of an environment like this one, got no {absent}.")
+        if len(state["draws"]) != self.num_envs:
             raise ValueError(
                 f"state must be of an environment like this one, of {self.num_envs} worlds, got "
-                f"{len(arrays['draws'])}."
+                f"{len(state['draws'])}."
             )
+        try:
+            self._restore(state)
+        except Exception:
+            self._restore(own)
+            raise
+
+    def _restore(self, state: Mapping[str, Tensor]) -> None:
+        arrays = {name: tensor.numpy(force=True).copy() for name, tensor in state.items()}
         # A placement may hold a path, which is code: it is drawn again.
         for row, draws in enumerate(arrays["draws"]):
             self._reset_world(row, unpack(draws))
@@ -370,7 +384,7 @@ class ArmEnv(EnvBase):
                 if name.startswith(_PHYSICS)
             }
         )
-        self._begun = True
+        self._begun = bool(arrays["begun"].all())
         self._generators = [unpack(packed) for packed in arrays["generators"]]
         if self.shield is not None:
             for name, array in self._shield_state().items():
@@ -504,7 +518,7 @@ class ArmEnv(EnvBase):
 
     def _pack(self, **arrays: np.ndarray) -> TensorDict:
         tensors = {
-            name: torch.from_numpy(array if array.dtype == bool else array.astype(np.float32))
+            name: torch.from_numpy(array.astype(bool if array.dtype == bool else np.float32))
             for name, array in arrays.items()
         }
         return TensorDict(tensors, batch_size=self.batch_size, device=self.device)

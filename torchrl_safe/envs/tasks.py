@@ -179,7 +179,7 @@ class Push:
         _check(self.region, self.radius)
         check_flag(shaped=self.shaped, sparse=self.sparse)
         _check_object(self.shape)
-        check_positive(distance=self.distance)
+        _check_distance(self.distance, self.radius)
 
     @property
     def objects(self) -> tuple[Shape, ...]:
@@ -265,7 +265,7 @@ class PickAndPlace:
         _check(self.region, self.radius)
         check_flag(shaped=self.shaped, sparse=self.sparse)
         _check_object(self.shape)
-        check_positive(distance=self.distance)
+        _check_distance(self.distance, self.radius)
         if not isinstance(self.on_table, Real) or not 0 <= self.on_table <= 1:
             raise ValueError(f"on_table must be between 0 and 1, got {self.on_table!r}.")
 
@@ -311,6 +311,12 @@ def _check(region: Region | None, radius: float) -> None:
     if region is not None:
         check_kind("region", region, Region)
     check_positive(radius=radius)
+
+
+def _check_distance(distance: float, radius: float) -> None:
+    check_positive(distance=distance)
+    if distance <= radius:
+        raise ValueError(f"distance must be more than radius, {radius}, got {distance}.")
 
 
 def _check_object(shape: Shape) -> None:

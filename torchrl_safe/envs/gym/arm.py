@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from tensordict import TensorDict
 
 from torchrl_safe.envs.arm_env import ArmEnv
+from torchrl_safe.envs.physics.mujoco import MuJoCo
 
 
 class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -60,7 +61,9 @@ class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                 raise TypeError(f"{name} must not be given, got {kwargs[name]!r}: {reason}.")
         self.render_mode = render_mode
         self.arm_env = ArmEnv(**kwargs, gui=render_mode == "human")
-        self.metadata = {**self.metadata, "render_fps": self.arm_env.control_rate}
+        # MuJoCo has no window here.
+        modes = ["rgb_array"] if isinstance(self.arm_env.physics, MuJoCo) else modes
+        self.metadata = {"render_modes": modes, "render_fps": self.arm_env.control_rate}
         # ArmEnv raises unless observations are finite. Gymnasium's checker warns of an infinite
         # bound, and the largest float32 says the same.
         largest = np.finfo(np.float32).max

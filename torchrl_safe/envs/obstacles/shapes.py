@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchrl_safe._checks import check_not_negative, check_positive, keep_numbers
+from torchrl_safe._checks import check_kind, check_not_negative, check_positive, keep_numbers
 from torchrl_safe.envs.rotations import UPRIGHT
 
 
@@ -72,6 +72,7 @@ class Cylinder:
         look: how it is drawn; by default in the colour of obstacles or of objects.
 
     Raises:
+        TypeError: if ``look`` is not a Look.
         ValueError: if a size is not positive or the mass is negative.
 
     Examples:
@@ -86,7 +87,7 @@ class Cylinder:
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius, height=self.height)
-        check_not_negative(mass=self.mass)
+        _check_rest(self.mass, self.look)
 
     @property
     def half_extents(self) -> tuple[float, float, float]:
@@ -104,6 +105,7 @@ class Box:
         look: how it is drawn; by default in the colour of obstacles or of objects.
 
     Raises:
+        TypeError: if ``look`` is not a Look.
         ValueError: if a size is not positive or the mass is negative.
 
     Examples:
@@ -118,7 +120,7 @@ class Box:
     def __post_init__(self) -> None:
         if not (keep_numbers(self, "half_extents", 3) > 0).all():
             raise ValueError(f"half_extents must be positive, got {self.half_extents}.")
-        check_not_negative(mass=self.mass)
+        _check_rest(self.mass, self.look)
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,7 @@ class Sphere:
         look: how it is drawn; by default in the colour of obstacles or of objects.
 
     Raises:
+        TypeError: if ``look`` is not a Look.
         ValueError: if the radius is not positive or the mass is negative.
 
     Examples:
@@ -144,7 +147,7 @@ class Sphere:
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius)
-        check_not_negative(mass=self.mass)
+        _check_rest(self.mass, self.look)
 
     @property
     def half_extents(self) -> tuple[float, float, float]:
@@ -163,6 +166,7 @@ class Capsule:
         look: how it is drawn; by default in the colour of obstacles or of objects.
 
     Raises:
+        TypeError: if ``look`` is not a Look.
         ValueError: if a size is not positive or the mass is negative.
 
     Examples:
@@ -177,12 +181,18 @@ class Capsule:
 
     def __post_init__(self) -> None:
         check_positive(radius=self.radius, length=self.length)
-        check_not_negative(mass=self.mass)
+        _check_rest(self.mass, self.look)
 
     @property
     def half_extents(self) -> tuple[float, float, float]:
         """Half of the size along the shape's own x, y and z axes, m."""
         return (self.radius, self.radius, self.length / 2 + self.radius)
+
+
+def _check_rest(mass: float, look: Look | None) -> None:
+    check_not_negative(mass=mass)
+    if look is not None:
+        check_kind("look", look, Look)
 
 
 #: What an obstacle or an object can look like.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_safe._checks import check_array, check_flag, check_positive, keep_numbers
+from torchrl_safe._checks import check_flag, check_not_negative, check_positive, keep_numbers
 
 #: Duration of one physics substep, s.
 SUBSTEP = 1 / 240
@@ -25,8 +25,8 @@ class Scene:
 
     Raises:
         TypeError: if a flag is not True or False.
-        ValueError: if ``gravity`` is not finite, a factor is not positive, or ``motor_strength`` is
-            not 1 for motors without limits.
+        ValueError: if ``gravity`` is negative or not finite, a factor is not positive, or
+            ``motor_strength`` is not 1 for motors without limits.
 
     Examples:
         >>> Scene(gravity=1.62).motor_limits
@@ -41,7 +41,7 @@ class Scene:
     friction: float = 1.0
 
     def __post_init__(self) -> None:
-        check_array("gravity", self.gravity, ())
+        check_not_negative(gravity=self.gravity)
         check_positive(
             motor_strength=self.motor_strength, link_mass=self.link_mass, friction=self.friction
         )

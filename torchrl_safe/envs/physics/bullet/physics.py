@@ -38,7 +38,7 @@ class Bullet:
 
     Raises:
         TypeError: if a flag is not True or False.
-        ValueError: if ``motor_gain`` is not positive.
+        ValueError: if ``motor_gain`` is not a share.
 
     Examples:
         >>> Bullet(motor_gain=0.1).merged_links
@@ -55,6 +55,8 @@ class Bullet:
     def __post_init__(self) -> None:
         if self.motor_gain is not None:
             check_positive(motor_gain=self.motor_gain)
+            if self.motor_gain > 1:
+                raise ValueError(f"motor_gain must be at most 1, got {self.motor_gain}.")
         check_flag(
             merged_links=self.merged_links,
             urdf_inertia=self.urdf_inertia,

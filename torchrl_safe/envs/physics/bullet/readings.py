@@ -124,11 +124,14 @@ class Readings:
         return point[8], -_dot(arm_velocity, normal), _dot(obstacle_velocity, normal)
 
     def _touch(self, bodies: Sequence[int]) -> float:
-        """Smallest distance among the contact points of what moves of the arm with bodies."""
+        """Smallest distance among the contact points of what moves of the arm with bodies.
+
+        It is at most 0 where they push: the solver holds them a hair apart.
+        """
         base = self._arm.base
         return min(
             (
-                point[8]
+                min(point[8], 0.0) if point[9] > 0 else point[8]
                 for body in bodies
                 for point in pybullet.getContactPoints(
                     self._arm.body, body, physicsClientId=self._client

@@ -447,9 +447,11 @@ class World:
 
     def picture(self, camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
         """Returns an RGB picture, ``(height, width, 3)``."""
-        view = pybullet.computeViewMatrix(camera.eye, camera.target, (0, 0, 1))
+        # A view straight down has no direction that is up in the picture: take x.
+        up = (1, 0, 0) if camera.eye[:2] == camera.target[:2] else (0, 0, 1)
+        view = pybullet.computeViewMatrix(camera.eye, camera.target, up)
         projection = pybullet.computeProjectionMatrixFOV(
-            camera.field_of_view, width / height, 0.1, 10
+            camera.field_of_view, width / height, 0.1, 10 + math.dist(camera.eye, camera.target)
         )
         pixels = pybullet.getCameraImage(
             width,

@@ -366,6 +366,7 @@ class MuJoCoSimulator:
         return {
             "state": self._batch.state.copy(),
             "steps": self._steps.copy(),
+            "frame_skip": np.full_like(self._steps, self._frame_skip),
             "contact_distance": self._contact_distance.copy(),
             "contact_force": self._contact_force.copy(),
             **{f"trace_{name}": values.copy() for name, values in self._trace.items()},
@@ -381,6 +382,11 @@ class MuJoCoSimulator:
                     f"{name} must be of an environment like this one, whose worlds have the shape "
                     f"{own[name].shape}, got {shape}."
                 )
+        if (saved["frame_skip"] != self._frame_skip).any():
+            raise ValueError(
+                f"frame_skip must be that of the saved episodes, {saved['frame_skip'][0]}, got "
+                f"{self._frame_skip}."
+            )
         self._steps[:] = saved["steps"]
         for row, steps in enumerate(self._steps.tolist()):
             self._tracks.seek(row, steps * self._frame_skip)
