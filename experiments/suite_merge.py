@@ -1,6 +1,7 @@
 """Puts suites that were run in several places into one: ``python -m experiments.suite_merge``.
 
-``docs/results/suite.json`` has PPO-Lagrangian's runs of docs/suite.md. Add runs of yours to them::
+``docs/results/suite.json`` has the runs of docs/suite.md. Add runs of yours, with the same seeds of
+both algorithms::
 
     python -m experiments.suite_merge --results docs/results/suite.json runs/suite/results.json
 """
