@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from torchrl_safe.envs.arms.models import ArmModel, Gripper
-from torchrl_safe.envs.arms.urdf_merge import merge_fixed_links
+from torchrl_safe.envs.arms.urdf_merge import end_of, merge_fixed_links
 
 _PACKAGE, _FILE = "package://", "file://"
 # What the names of an attached gripper begin with, so that they are not those of the arm.
@@ -90,14 +90,14 @@ def find_urdf(name: str) -> Path:
 
 def movable_chain(root: ElementTree.Element, tip: str) -> set[str]:
     """Returns the names of the movable joints between the base and a link."""
-    parents = {_end(joint, "child"): joint for joint in root.findall("joint")}
+    parents = {end_of(joint, "child"): joint for joint in root.findall("joint")}
     chain = set()
     link = tip
     while link in parents:
         joint = parents[link]
         if joint.get("type") != "fixed":
             chain.add(joint.get("name", ""))
-        link = _end(joint, "parent")
+        link = end_of(joint, "parent")
     return chain
 
 
@@ -157,7 +157,7 @@ def _settle(joint: ElementTree.Element) -> None:
 
 def _weigh_frames(root: ElementTree.Element) -> None:
     # A link without inertia only names a frame, but an engine may give it 1 kg.
-    fixed = {_end(j, "child") for j in root.findall("joint") if j.get("type") == "fixed"}
+    fixed = {end_of(j, "child") for j in root.findall("joint") if j.get("type") == "fixed"}
     for link in root.findall("link"):
         if link.get("name") in fixed and link.find("inertial") is None:
             inertial = ElementTree.SubElement(link, "inertial")
@@ -170,7 +170,7 @@ def _attach(arm: ElementTree.Element, ee_link: str, gripper: Gripper, *, visuals
     """Adds a gripper to the URDF of an arm; returns the name that its tool link has there."""
     root = _read(gripper.urdf, visuals=visuals)
     _check_link("tool_link", root, gripper.tool_link)
-    children = {_end(joint, "child") for joint in root.findall("joint")}
+    children = {end_of(joint, "child") for joint in root.findall("joint")}
     palm = next(name for name in _link_names(root) if name not in children)
     for element in root.iter():
         for key in ("name", "link", "joint"):
@@ -195,12 +195,6 @@ def _check_link(argument: str, root: ElementTree.Element, name: str) -> None:
 
 def _link_names(root: ElementTree.Element) -> list[str]:
     return [link.get("name", "") for link in root.findall("link")]
-
-
-def _end(joint: ElementTree.Element, side: str) -> str:
-    """Name of the parent or child link of a joint."""
-    link = joint.find(side)
-    return "" if link is None else link.get("link", "")
 
 
 def _find_mesh(urdf: Path, name: str) -> Path:

@@ -23,19 +23,19 @@ def merge_fixed_links(root: Element, keep: str) -> None:
         keep: name of a link that stays, without shapes and mass, if only to name a frame.
     """
     links = {link.get("name"): link for link in root.findall("link")}
-    joints = {_end(joint, "child"): joint for joint in root.findall("joint")}
+    joints = {end_of(joint, "child"): joint for joint in root.findall("joint")}
     for name in _leaves_first(list(joints), joints):
         joint = joints[name]
         if joint.get("type") != "fixed":
             continue
-        holder, frame = _end(joint, "parent"), _frame(joint)
+        holder, frame = end_of(joint, "parent"), _frame(joint)
         _add_inertia(links[holder], links[name], frame)
         for part in [*links[name].findall("collision"), *links[name].findall("visual")]:
             _place(part, frame @ _frame(part))
             links[holder].append(part)
             links[name].remove(part)
         for child in joints.values():
-            if _end(child, "parent") == name:
+            if end_of(child, "parent") == name:
                 _place(child, frame @ _frame(child))
                 child.find("parent").set("link", holder)  # type: ignore[union-attr]
         if name != keep:
@@ -45,7 +45,7 @@ def merge_fixed_links(root: Element, keep: str) -> None:
 
 def _leaves_first(names: list[str], joints: dict[str, Element]) -> list[str]:
     def depth(name: str) -> int:
-        return 1 + depth(_end(joints[name], "parent")) if name in joints else 0
+        return 1 + depth(end_of(joints[name], "parent")) if name in joints else 0
 
     return sorted(names, key=depth, reverse=True)
 
@@ -124,7 +124,8 @@ def _turn(axis: int, angle: float) -> Array:
     return matrix
 
 
-def _end(joint: Element, side: str) -> str:
+def end_of(joint: Element, side: str) -> str:
+    """Name of the parent or child link of a joint."""
     link = joint.find(side)
     return "" if link is None else link.get("link", "")
 
