@@ -509,6 +509,7 @@ def test_bad_arguments(arguments, message):
         ({"observation": lambda s: s.goal}, "what observation returns must be an instance of Map"),
         ({"costs": [Collision()]}, "costs must be an instance of Mapping"),
         ({"costs": {"c": Collision}}, "cost 'c' must be a callable object, got <class"),
+        ({"costs": {1: Collision()}}, r"costs must have names that are strings, got \[1\]"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )

@@ -158,3 +158,9 @@ def test_every_shape_is_drawn(make_env):
 def test_bad_arguments(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("kind", [Box, Capsule, Cylinder, Sphere])
+def test_a_look_is_a_look(kind):
+    with pytest.raises(TypeError, match="look must be an instance of Look, got 'red'"):
+        kind(look="red")

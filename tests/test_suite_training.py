@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -101,6 +102,12 @@ def test_a_share_of_each_limit_is_what_training_aims_at():
     assert updater.cost_limit.tolist() == transform.budget.tolist() == [0.125, 0.25, 0.25]
     assert config.cost_limits == {"collision": 0.25, "joint-limit": 0.5, "speed": 0.5}
     env.close()
+
+
+def test_a_saved_policy_is_evaluated_with_the_budget_of_its_training():
+    settings = json.loads(json.dumps(dataclasses.asdict(Config(limit_share=0.5)), default=str))
+    saved = SimpleNamespace(settings={**settings, "name": "ppo-saute"})
+    assert evaluate.training_config(saved).aims == {"collision": 0.25}
 
 
 @pytest.mark.parametrize("algorithm", ["ppo-saute", "ppo-early-termination"])
