@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import tyro
 
-from experiments.options import short_help
+from experiments.options import check_once, short_help
 from torchrl_safe.envs import SUITE, PickAndPlace, Push, Reach
 
 Action = Literal["cartesian", "joint"]
@@ -201,10 +201,7 @@ class Config:
                 f"demonstrations must be 0 with joint actions, got {self.demonstrations}: pilots "
                 "say where the tool is to go."
             )
-        if not self.algorithms or len({*self.algorithms}) < len(self.algorithms):
-            raise ValueError(
-                f"algorithms must name at least one, each once, got {self.algorithms}."
-            )
+        check_once("algorithms", self.algorithms)
         for cost, limit in self.costs.items():
             if not 0 <= limit < math.inf:
                 raise ValueError(f"costs must have limits of at least 0, got {limit} for {cost}.")

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 from torchrl_safe._files import UNFINISHED, writing
 
@@ -14,6 +18,16 @@ def write_whole(path: Path, text: str) -> None:
     """Writes a text, whole or not at all."""
     with writing(path) as file:
         file.write(text.encode())
+
+
+def as_json(config: Any) -> dict[str, Any]:
+    """The settings of a run, a dataclass, as a file has them."""
+    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
+
+
+def lasting(settings: Mapping[str, Any], changeable: Collection[str]) -> dict[str, Any]:
+    """Those settings that a run keeps when it is resumed."""
+    return {name: value for name, value in settings.items() if name not in changeable}
 
 
 def require_new(folder: Path, hint: str = "") -> None:

@@ -17,17 +17,14 @@ from tqdm import tqdm
 
 from experiments.files import write_whole
 from experiments.log import versions
+from experiments.options import check_once
 from torchrl_safe.checkpoint import refuse_other_settings
 
 
 def check_grid(config: Any, *names: str) -> None:
     """Checks the settings of a grid: ``jobs``, and what it goes through, each thing once."""
     for name in names:
-        values = getattr(config, name)
-        # Files are named by six digits of a fraction.
-        named = {f"{value:g}" if isinstance(value, float) else str(value) for value in values}
-        if not values or len(named) < len(values):
-            raise ValueError(f"{name} must name at least one, each once, got {values}.")
+        check_once(name, getattr(config, name))
     if config.jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {config.jobs}.")
 
@@ -58,14 +55,16 @@ def side_by_side(
         try:
             calls = iter(enumerate(arguments))
             running: dict[Future[Any], int] = {}
-            # The pool itself would begin one more call than it has workers.
-            while running := running | {
-                pool.submit(run, *each): index
-                for index, each in islice(calls, workers - len(running))
-            }:
+
+            def begin(count: int) -> None:
+                running.update((pool.submit(run, *each), n) for n, each in islice(calls, count))
+
+            begin(workers)  # The pool itself would begin one more than it has workers.
+            while running:
                 ended, _ = wait(running, return_when=FIRST_COMPLETED)
                 for call in ended:
                     yield running.pop(call), call.result()
+                begin(len(ended))
         except Exception:
             pool.shutdown(cancel_futures=True)
             raise

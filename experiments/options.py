@@ -14,6 +14,14 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 _WIDTH, _COLUMN = 100, 36
 
 
+def check_once(name: str, values: Sequence[Any]) -> None:
+    """Raises ValueError unless an option names at least one thing, each once."""
+    # Files are named by six digits of a fraction.
+    named = {f"{value:g}" if isinstance(value, float) else str(value) for value in values}
+    if not values or len(named) < len(values):
+        raise ValueError(f"{name} must name at least one, each once, got {values}.")
+
+
 def short_help(config: Any, groups: Mapping[str, Sequence[str]]) -> str:
     """Returns a line for each option: its default, and what it is.
 

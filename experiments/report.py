@@ -72,6 +72,11 @@ def successes(runs: list[dict[str, Any]]) -> list[float]:
     return [run["evaluation"]["success"][0] for run in runs]
 
 
+def shown_cost(cost: float, limit: float) -> str:
+    """A cost for a table, bold above its limit."""
+    return f"**{cost:.2f}**" if cost > limit else f"{cost:.2f}"
+
+
 def mean_over_seeds(costs: torch.Tensor) -> str:
     """Mean of (seeds, episodes) with its 95 % interval over seeds; of one seed the mean alone."""
     if len(costs) == 1:

@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
 from experiments.compiling import compiled
-from experiments.files import TO_RESUME, require_new, write_whole
+from experiments.files import TO_RESUME, as_json, lasting, require_new, write_whole
 from experiments.learners import NOT_LEARNT_FROM, Objective, moved_from_here, summed, tell_length
 from experiments.log import Log, figures, versions
 from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
@@ -442,7 +442,7 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     checkpoints = RunCheckpoints(
         config.out / "checkpoints",
         {name: part for name, part in state.items() if part is not None},
-        settings=_lasting(dataclasses.asdict(config)),
+        settings=lasting(dataclasses.asdict(config), CHANGEABLE),
     )
     if config.resume:
         checkpoints.load()
@@ -451,8 +451,13 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     log.open()
     collector = make_collector(config, env, agent)
     begin_episodes(config, collector, log.frames)
-    with tqdm(total=config.frames, unit="frame", unit_scale=True, disable=not progress) as bar:
-        bar.initial = bar.n = bar.last_print_n = log.frames  # Not what this process has done.
+    with tqdm(
+        total=config.frames,
+        initial=log.frames,
+        unit="frame",
+        unit_scale=True,
+        disable=not progress,
+    ) as bar:
         for batch in islice(collector, batches - len(log.rows)):
             episodes = batch["next"][batch["next", "done"].squeeze(-1)]
             if updater is not None:
@@ -475,23 +480,14 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     return agent, log
 
 
-def _lasting(settings: dict[str, Any]) -> dict[str, Any]:
-    """Those settings that a run keeps when it is resumed."""
-    return {name: value for name, value in settings.items() if name not in CHANGEABLE}
-
-
-def as_json(config: Config) -> dict[str, Any]:
-    """The settings as a file has them."""
-    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
-
-
 def start(config: Config) -> None:
     """Begins a run, unless its folder has one of this script that is to be resumed."""
     path = config.out / "results.json"
     if config.resume and path.exists():
         before = json.loads(path.read_text())["config"]
         if "env" in before:
-            refuse_other_settings(_lasting(before), _lasting(as_json(config)))
+            now = as_json(config)
+            refuse_other_settings(lasting(before, CHANGEABLE), lasting(now, CHANGEABLE))
             return
     require_new(config.out, "There is no run in it to resume." if config.resume else TO_RESUME)
     if config.resume:

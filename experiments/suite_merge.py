@@ -41,7 +41,7 @@ def merge(results: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
         ValueError: unless every algorithm has run on the same tasks with the same seeds.
     """
     found = {(run["task"], run["algorithm"], run["seed"]): run for runs in results for run in runs}
-    tasks = [task for task in SUITE if any(task == known for known, *_ in found)]
+    tasks = sorted({task for task, *_ in found}, key=[*SUITE].index)
     algorithms = [*dict.fromkeys(algorithm for _, algorithm, _ in found)]
     seeds = {seed for *_, seed in found}
     if absent := [key for key in product(tasks, algorithms, seeds) if key not in found]:

@@ -20,6 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from experiments.report import shown_cost
 from experiments.style import colour, figure_style, label, limit_line
 from torchrl_safe.envs import SUITE
 from torchrl_safe.metrics import Estimate, interquartile_mean, mean
@@ -88,7 +89,7 @@ def table(runs: Sequence[Run], limits: Limits) -> str:
         head = f"`{task}`"
         for name, limit in limits[task].items():
             costs = [
-                ", ".join(_cost(cost, limit) for cost in _each(mine, f"cost/{name}"))
+                ", ".join(shown_cost(cost, limit) for cost in _each(mine, f"cost/{name}"))
                 for mine in of_task
             ]
             lines.append(f"| {head} | {name} | {limit:g} | {' | '.join([*costs, *success])} |")
@@ -248,19 +249,15 @@ def _select(runs: Sequence[Run], task: str, algorithm: str) -> list[Run]:
 
 
 def _mean_of(runs: Sequence[Run], part: str, name: str) -> float:
-    return float(np.mean([run[part][name][0] for run in runs]))
+    return float(np.mean(_each(runs, name, part)))
 
 
-def _each(runs: Sequence[Run], name: str) -> list[float]:
-    return [run["evaluation"][name][0] for run in runs]
+def _each(runs: Sequence[Run], name: str, part: str = "evaluation") -> list[float]:
+    return [run[part][name][0] for run in runs]
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.1f}".removesuffix(".0")
-
-
-def _cost(cost: float, limit: float) -> str:
-    return f"**{cost:.2f}**" if cost > limit else f"{cost:.2f}"
 
 
 def _summed(runs: Sequence[Run], name: str) -> float:

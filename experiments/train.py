@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
@@ -28,7 +28,7 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, Training, configured, own_settings
 from experiments.config import AlgorithmName, Config, command_line
 from experiments.demonstrations import CARE, start_from_demonstrations
-from experiments.files import TO_RESUME, require_new, write_whole
+from experiments.files import TO_RESUME, as_json, lasting, require_new, write_whole
 from experiments.film import Policy, save_film
 from experiments.grid import side_by_side
 from experiments.log import Log, figures, progress_text, score, summed_costs, versions
@@ -206,11 +206,6 @@ def collecting(
         collector.shutdown()
 
 
-def settings(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Those fields of a configuration that a run keeps when it is resumed."""
-    return {name: value for name, value in fields.items() if name not in CHANGEABLE}
-
-
 def train(
     config: Config, algorithm: AlgorithmName, *, progress: bool = True, line: int = 0
 ) -> tuple[TensorDictModuleBase, Log]:
@@ -251,7 +246,7 @@ def train(
                 "log": log,
                 "generators": GlobalRNGState(),
             },
-            settings={"algorithm": algorithm, **settings(dataclasses.asdict(config))},
+            settings={"algorithm": algorithm, **lasting(dataclasses.asdict(config), CHANGEABLE)},
         )
         if not config.resume:
             checkpoints.clear()
@@ -307,13 +302,13 @@ def begun(config: Config, algorithm: AlgorithmName, training: Training) -> RunCh
             "cost_critic": training.loss.cost_critic_network,
             "generators": GlobalRNGState(),
         },
-        settings={**settings(dataclasses.asdict(config)), **depends_on},
+        settings={**lasting(dataclasses.asdict(config), CHANGEABLE), **depends_on},
     )
 
 
 def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) -> None:
     """Writes the policy to a file of its own, with what it was trained for."""
-    trained = {**json.loads(json.dumps(dataclasses.asdict(config), default=str)), "name": algorithm}
+    trained = {**as_json(config), "name": algorithm}
     save_policy(
         config.out / algorithm / "policy.pt",
         training.actor,
@@ -367,7 +362,8 @@ def start(config: Config) -> dict[str, Any]:
     }
     if config.resume and path.exists():
         before = json.loads(path.read_text())
-        refuse_other_settings(settings(before["config"]), settings(results["config"]))
+        was, now = (lasting(each["config"], CHANGEABLE) for each in (before, results))
+        refuse_other_settings(was, now)
         results["algorithms"] = before["algorithms"]
     elif config.resume:
         require_new(config.out, "There is no run in it to resume.")

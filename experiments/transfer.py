@@ -24,6 +24,8 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from experiments import train
 from experiments.algorithms import ALGORITHMS, no_transforms
 from experiments.grid import check_grid, run_grid, save_results
+from experiments.report import shown_cost
+from experiments.suite_report import excess
 from torchrl_safe.envs import (
     SUITE,
     ArmState,
@@ -267,7 +269,7 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
     for condition in conditions:
         row = {name: figures[name, condition] for name in limits}
         played = {name: each for name, each in row.items() if each is not None}
-        kept = sum(not _exceeded(each, limits[name]) for name, each in played.items())
+        kept = sum(excess(each, limits[name]) <= 1 for name, each in played.items())
         cells = [_cell(each, limits[name]) for name, each in row.items()]
         lines.append(f"| {condition} | {' | '.join(cells)} | {kept}/{len(played)} |")
     lines.append("\nSuccess; the mean of each cost, bold where it is above its limit.")
@@ -280,16 +282,10 @@ def name_of(policy: str) -> str:
     return "-".join(path.parts[-4:-1]) if path.name == "policy.pt" else path.stem
 
 
-def _exceeded(figures: Mapping[str, Any], limits: Mapping[str, float]) -> list[str]:
-    return [name for name, limit in limits.items() if figures[f"cost/{name}"][0] > limit]
-
-
 def _cell(figures: Mapping[str, Any] | None, limits: Mapping[str, float]) -> str:
     if figures is None:
         return ""
-    above = _exceeded(figures, limits)
-    costs = {name: f"{figures[f'cost/{name}'][0]:.2f}" for name in limits}
-    shown = [f"**{cost}**" if name in above else cost for name, cost in costs.items()]
+    shown = [shown_cost(figures[f"cost/{name}"][0], limit) for name, limit in limits.items()]
     return f"{figures['success'][0]:.0%}; {', '.join(shown)}"
 
 

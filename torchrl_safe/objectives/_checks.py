@@ -14,6 +14,11 @@ _LARGEST = torch.finfo(torch.float32).max
 _SMALLEST, _LARGE = 1e-18, 1e18
 
 
+def uncompiled(loss_module: Any) -> Any:
+    """The loss itself, of one that :func:`torch.compile` wraps: no public attribute has it."""
+    return getattr(loss_module, "_orig_mod", loss_module)
+
+
 def check_number(name: str, value: Any, *, positive: bool = False) -> float:
     """Returns the value; raises ValueError unless it is finite, not negative or even positive.
 

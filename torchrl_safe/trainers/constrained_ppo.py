@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule
 from torchrl.trainers.algorithms import PPOTrainer
 
 from torchrl_safe.objectives import CUPLoss, TrustRegionLoss
+from torchrl_safe.objectives._checks import uncompiled
 from torchrl_safe.objectives.critics.cost_critic import CostCritic
 from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 from torchrl_safe.trainers.multiplier_hook import MultiplierHook
@@ -138,7 +139,7 @@ class ConstrainedPPOTrainer(PPOTrainer):
 
 
 def _check_loss(loss_module: LossModule) -> None:
-    loss_module = getattr(loss_module, "_orig_mod", loss_module)  # What torch.compile wraps.
+    loss_module = uncompiled(loss_module)
     if not isinstance(loss_module, CostCritic):
         raise TypeError(
             "loss_module must be an on-policy loss with a cost critic, such as PPOLagrangianLoss, "

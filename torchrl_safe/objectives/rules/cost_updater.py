@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._checks import as_number, as_tensor, check_number
+from torchrl_safe.objectives._checks import as_number, as_tensor, check_number, uncompiled
 
 #: Which updaters write which buffer of a loss.
 _UPDATERS = {
@@ -43,7 +43,7 @@ class CostUpdater(abc.ABC):
         pessimism: float = 0.0,
         cost_names: Sequence[str] | None = None,
     ) -> None:
-        loss_module = getattr(loss_module, "_orig_mod", loss_module)  # What torch.compile wraps.
+        loss_module = uncompiled(loss_module)
         if not isinstance(loss_module, LossModule):
             raise ValueError(f"loss_module must be a LossModule, got {type(loss_module)}.")
         buffers = dict(loss_module.named_buffers(recurse=False))

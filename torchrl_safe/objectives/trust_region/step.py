@@ -214,11 +214,11 @@ class TrustRegionStep:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the counts and ``episode_length``; the actor is in the state of the loss."""
-        return {name: getattr(self, name) for name in (*_COUNTS, "episode_length")}
+        return {name: getattr(self, name) for name in _STATE}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads a state that :meth:`state_dict` returned."""
-        for name in (*_COUNTS, "episode_length"):
+        for name in _STATE:
             setattr(self, name, state_dict[name])
 
     @torch.no_grad()
@@ -350,6 +350,7 @@ class TrustRegionStep:
 
 _NUMBERS = ("kl", "surrogate_gain", "cost_surrogate_change", "step_fraction", "constraint_active")
 _COUNTS = ("rejected_steps", "indefinite_steps", "recovery_steps")
+_STATE = (*_COUNTS, "episode_length")
 
 
 def _checked_gradient(name: str, surrogate: Tensor, actor: ActorCopy) -> Tensor:
