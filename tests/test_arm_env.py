@@ -11,22 +11,18 @@ import torch
 from bullet_worlds import worlds_of
 from scripted import fly, over, straight
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
-from torchrl.record import PixelRenderTransform
 from worlds import each_arm
 
 from torchrl_safe.envs import (
     ArmEnv,
     Bullet,
-    Camera,
     CartesianDelta,
     Collision,
     Cylinder,
     FullObservation,
     InFront,
     JointDelta,
-    MuJoCo,
     NoObstacles,
     Placement,
     Push,
@@ -611,78 +607,3 @@ def test_velocities_are_derivatives(make_env, action):
             change = (getattr(after, position) - getattr(before, position)) * 240
             np.testing.assert_allclose(getattr(after, velocity), change, atol=0.02)
     assert np.abs(env.arm_state.ee_velocity).max() > 0.1
-
-
-def test_render(make_env):
-    env = make_env(ArmEnv, num_envs=2, seed=0)
-    env.reset()
-    pixels = env.render(width=96, height=64)
-    assert pixels.shape == (2, 64, 96, 3)
-    assert pixels.dtype == torch.uint8
-    red, green, blue = pixels.int().unbind(-1)
-    dark = (red < 80) & (green < 90) & (blue > red + 5)
-    assert dark.flatten(1).sum(1).min() > 20, "the obstacle is in the picture"
-    assert not torch.equal(pixels[0], pixels[1]), "each world has its own goal"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"eye": (1, 2)}, r"eye must have shape \(3,\), got \(2,\)"),
-        ({"eye": (0, 0, 1), "target": (0, 0, 1)}, "eye must not be where it looks"),
-        ({"field_of_view": 0}, "field_of_view must be positive and finite, got 0"),
-        ({"field_of_view": 180}, "field_of_view must be less than 180, got 180"),
-    ],
-)
-def test_camera_rejects(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        Camera(**arguments)
-
-
-@pytest.mark.parametrize("eye", [(0.4, 0.0, 1.5), (12.0, 0.0, 4.0)], ids=["down", "far"])
-@pytest.mark.parametrize("physics", [Bullet(), MuJoCo(threads=1)], ids=["bullet", "mujoco"])
-def test_a_camera_may_look_straight_down_and_from_afar(make_env, eye, physics):
-    env = make_env(ArmEnv, physics=physics)
-    env.reset()
-    picture = env.render(64, 48, Camera(eye=eye, target=(0.4, 0.0, 0.0)))[0]
-    assert len(picture.reshape(-1, 3).unique(dim=0)) > 1  # Not the background alone.
-
-
-def test_render_wants_a_camera(make_env):
-    env = make_env(ArmEnv)
-    with pytest.raises(TypeError, match="camera must be an instance of Camera, got 'above'"):
-        env.render(camera="above")
-
-
-def test_pixels_in_a_rollout(make_env):
-    """TorchRL's transform makes an observation of what render() draws."""
-    transform = PixelRenderTransform(width=32, height=24)
-    env = make_env(lambda: TransformedEnv(ArmEnv(num_envs=2, seed=0), transform))
-    pixels = env.rollout(2)["next", "pixels"]
-    assert pixels.shape == (2, 2, 24, 32, 3)
-    assert pixels.float().std() > 10
-
-
-@both_engines
-def test_pictures_show_the_arm_and_the_target(make_env):
-    env = make_env(ArmEnv, num_envs=2, obstacles=NoObstacles(), seed=0)
-
-    def targets(pixels):
-        """Where the green marker of each world is: row and column."""
-        red, green, blue = pixels.int().unbind(-1)
-        marked = (green > red + 50) & (green > blue + 20)
-        assert marked.flatten(1).any(1).all(), "the target is in the picture"
-        return [picture.nonzero().float().mean(0) for picture in marked]
-
-    env.reset()
-    before = env.render(width=96, height=96)
-    one, two = targets(before)
-    assert (one - two).abs().max() > 2, "each world has its own target"
-    wide = env.render(width=192, height=96)
-    shown = wide[:, :, 48:144].int() - before.int()
-    assert shown.abs().max() < 10, "more width shows more, at the same scale"
-    for _ in range(10):
-        step(env, torch.tensor([[1.0, 1, 1], [0, 0, 0]]))
-    changed = (env.render(width=96, height=96).int() - before.int()).abs().sum(-1) > 60
-    assert changed[0].sum() > 200
-    assert changed[1].sum() < 20

@@ -6,6 +6,7 @@ import numpy as np
 import pybullet
 import pytest
 import torch
+from bullet_worlds import worlds_of
 from worlds import ARMS, Places, each_arm, home_of, rest, step
 
 from torchrl_safe.envs import (
@@ -95,7 +96,7 @@ def test_no_press_on_the_table_is_lost(make_env):
         seed=0,
     )
     env.reset()
-    world = env._simulator.worlds[0]  # The force is not among the readings.
+    (world,) = worlds_of(env)  # The force is not among the readings.
     rng = np.random.default_rng(0)
     for index in range(60):
         action = [0, 0, -1] if index < 12 else rng.normal([0, 0, -0.3], [0.7, 0.7, 0.5])
