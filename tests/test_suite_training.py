@@ -84,7 +84,7 @@ def test_costs_are_chosen_each_with_a_limit():
 
 
 def test_every_limit_reaches_the_updater():
-    config = dataclasses.replace(suite_config("iiwa-reach-joints"), physics="mujoco")
+    config = suite_config("iiwa-reach-joints", physics="mujoco", limit_share=1.0)
     env = train.make_env(config, num_envs=2, seed=0)
     for algorithm in ("ppo-lagrangian", "trpo-lagrangian", "p3o"):
         updater = train.ALGORITHMS[algorithm].build(env, config).updater
@@ -104,6 +104,11 @@ def test_a_share_of_each_limit_is_what_training_aims_at():
     env.close()
 
 
+def test_the_suite_aims_at_one_share_of_all_limits():
+    (share,) = {suite_config(name).limit_share for name in SUITE}
+    assert share < 1
+
+
 def test_a_saved_policy_is_evaluated_with_the_budget_of_its_training():
     settings = json.loads(json.dumps(dataclasses.asdict(Config(limit_share=0.5)), default=str))
     saved = SimpleNamespace(settings={**settings, "name": "ppo-saute"})
@@ -112,7 +117,7 @@ def test_a_saved_policy_is_evaluated_with_the_budget_of_its_training():
 
 @pytest.mark.parametrize("algorithm", ["ppo-saute", "ppo-early-termination"])
 def test_every_limit_is_a_budget(algorithm):
-    config = suite_config(NAME, physics="mujoco")
+    config = suite_config(NAME, physics="mujoco", limit_share=1.0)
     env = train.make_env(config, num_envs=1, algorithm=algorithm, training=True)
     (transform,) = (each for each in env.transform if hasattr(each, "budget"))
     assert transform.budget.tolist() == [*SUITE[NAME].cost_limits.values()]
