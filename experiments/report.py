@@ -64,7 +64,8 @@ def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Mapping[
 
 def episode_costs(runs: list[dict[str, Any]]) -> torch.Tensor:
     """Costs of the evaluated episodes of some runs, shape (seeds, episodes)."""
-    return torch.tensor([run["episodes"]["episode_cost"] for run in runs]).squeeze(-1)
+    costs = torch.tensor([run["episodes"]["episode_cost"] for run in runs])
+    return costs.reshape(costs.shape[:2])  # Raises if there are several costs.
 
 
 def successes(runs: list[dict[str, Any]]) -> list[float]:

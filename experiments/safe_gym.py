@@ -444,6 +444,10 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
         {name: part for name, part in state.items() if part is not None},
         settings=lasting(dataclasses.asdict(config), CHANGEABLE),
     )
+    # Environment and learner could be made: only now the folder is this run's.
+    config.out.mkdir(parents=True, exist_ok=True)
+    if not (results := config.out / "results.json").exists():
+        write_whole(results, json.dumps({"config": dataclasses.asdict(config)}, default=str))
     if config.resume:
         checkpoints.load()
     else:
@@ -480,8 +484,8 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     return agent, log
 
 
-def start(config: Config) -> None:
-    """Begins a run, unless its folder has one of this script that is to be resumed."""
+def check_folder(config: Config) -> None:
+    """Raises unless the folder is empty, or has a run of this script that is to be resumed."""
     path = config.out / "results.json"
     if config.resume and path.exists():
         before = json.loads(path.read_text())["config"]
@@ -492,13 +496,11 @@ def start(config: Config) -> None:
     require_new(config.out, "There is no run in it to resume." if config.resume else TO_RESUME)
     if config.resume:
         print(f"There is no run in {config.out} to resume: this begins one.")
-    config.out.mkdir(parents=True, exist_ok=True)
-    write_whole(path, json.dumps({"config": dataclasses.asdict(config)}, default=str))
 
 
 def main(config: Config) -> dict[str, Any]:
     """Trains, evaluates, and writes the results."""
-    start(config)
+    check_folder(config)
     agent, log = train(config)
     seconds = log.seconds
     env = make_env(config)
@@ -508,8 +510,14 @@ def main(config: Config) -> dict[str, Any]:
         env.observation_spec_unbatched,
         settings=as_json(config),
     )
-    # The statistics of observations stay as they are.
-    episodes = evaluate(env, agent.actor, config.eval_episodes, seed=EVALUATION + config.seed)
+    # The statistics of observations stay as they are. Episodes that ended in training end here too.
+    episodes = evaluate(
+        env,
+        agent.actor,
+        config.eval_episodes,
+        seed=EVALUATION + config.seed,
+        max_steps=max(10_000, config.frames),
+    )
     env.close()
     results = {
         "config": dataclasses.asdict(config),

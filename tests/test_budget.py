@@ -115,14 +115,14 @@ def test_saute_discounts():
     assert rewards.tolist() == [10.0, 20.0, -7.0]
 
 
-@pytest.mark.parametrize("budget", [10.0, 3.0, 7.0])
+@pytest.mark.parametrize("budget", [10.0, 3.0, 7.0, 10_000.0])
 def test_a_budget_that_is_just_used_up_is_not_exceeded_by_rounding(budget):
     saute = Saute(budget, unsafe_reward=-1.0)
     left = torch.ones(1, 1)
     for _ in range(int(budget)):
         left = saute.advance(left, torch.ones(1, 1))
         assert not saute.is_spent(left)
-    assert saute.is_spent(saute.advance(left, torch.ones(1, 1) * 1e-3))
+    assert saute.is_spent(saute.advance(left, torch.full((1, 1), 1e-3 * budget)))
 
 
 def test_each_cost_has_its_budget():
@@ -193,15 +193,16 @@ def test_only_more_than_the_budget_ends_an_episode(budget, steps):
     ).all()
 
 
-def test_a_budget_that_is_just_used_up_ends_no_episode_by_rounding():
+@pytest.mark.parametrize(("budget", "count"), [(1.0, 10), (10.0, 1000)])
+def test_a_budget_that_is_just_used_up_ends_no_episode_by_rounding(budget, count):
     """Ten times 0.1 is more than 1 in single precision."""
-    ending = EarlyTermination(1.0)
+    ending = EarlyTermination(budget)
     tally = torch.zeros(1, 1)
-    for _ in range(10):
-        tally = ending.advance(tally, torch.full((1, 1), 0.1))
-    assert tally > 1
+    for _ in range(count):
+        tally = ending.advance(tally, torch.full((1, 1), budget / count))
+    assert tally > budget
     assert not ending.is_spent(tally)
-    assert ending.is_spent(ending.advance(tally, torch.full((1, 1), 1e-3)))
+    assert ending.is_spent(ending.advance(tally, torch.full((1, 1), 1e-3 * budget)))
 
 
 def test_one_cost_of_several_ends_an_episode():
@@ -539,6 +540,12 @@ def test_wrong_budgets(transform, budget):
 def test_wrong_numbers(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_rewards_of_numpy_are_numbers():
+    assert type(Saute(1.0, unsafe_reward=np.array(-1)).unsafe_reward) is float
+    early = EarlyTermination(1.0, termination_reward=np.float64(-1))
+    assert type(early.termination_reward) is float
 
 
 @pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])

@@ -232,6 +232,39 @@ def test_what_a_killed_process_left_is_cleared_away(run, net):
     assert not left.parent.exists()
 
 
+def test_a_run_does_not_save_before_what_another_has_saved(run, net):
+    """The rotation keeps the highest steps: it would remove the new file at once."""
+    save(run, net, 90)
+    other = RunCheckpoints(run.folder, {"net": net}, settings={"arms": ("c",)})
+    with pytest.raises(
+        ValueError, match=r"step must not be less .* got 10, .*-000000000090.torchrl"
+    ):
+        other.save(10)
+    other.clear()
+    assert other.save(10).exists()
+    assert other.load() == 10
+
+
+def test_what_was_skipped_is_removed_by_the_next_save(run, net):
+    save(run, net, 5)
+    save(run, net, 9).write_bytes(b"torn")
+    with pytest.warns(UserWarning, match="Going on from"):
+        assert run.load() == 5
+    saved = save(run, net, 7)
+    assert [path.name[-10:] for path in sorted(run.folder.iterdir())] == [
+        "05.torchrl",
+        "07.torchrl",
+    ]
+    assert run.load() == 7
+    assert saved.exists()
+
+
+@pytest.mark.parametrize("step", [-1, 1.5, True])
+def test_steps_are_whole_numbers(run, step):
+    with pytest.raises(ValueError, match="step must be a whole number of at least 0, got"):
+        run.save(step)
+
+
 def test_settings_that_differ_are_named():
     same = {"lr": 0.1, "seed": 0, "old": 1}
     refuse_other_settings(same, dict(same))

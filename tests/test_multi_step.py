@@ -9,11 +9,14 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
 from torchrl.envs import (
+    Compose,
     FrameSkipTransform,
+    GymEnv,
     MultiStepTransform,
     ParallelEnv,
     RewardSum,
     SerialEnv,
+    Transform,
     TransformedEnv,
 )
 from torchrl.envs.utils import check_env_specs
@@ -125,6 +128,32 @@ def test_in_a_collector(make_env):
 
 def counting(num_envs=None):
     return TransformedEnv(CountingBatch(num_envs), CostToReward())
+
+
+class Half(Transform):
+    def __init__(self):
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+
+    def _inv_apply_transform(self, state):
+        return state * 0.5
+
+
+def test_other_transforms_change_each_frames_action_once(make_env):
+    """Wherever they stand: before, after, or around an environment inside."""
+
+    def run(*transforms):
+        env = GymEnv("Pendulum-v1")
+        for transform in transforms:
+            env = TransformedEnv(env, transform, auto_unwrap=False)
+        env = make_env(lambda: env)
+        env.set_seed(0)
+        act = lambda td: td.set("action", torch.ones(1))  # noqa: E731
+        return env.rollout(4, act)["next", "observation"]
+
+    after = run(Compose(FrameSkip(3), Half()))
+    assert torch.equal(run(Compose(Half(), FrameSkip(3))), after)
+    assert torch.equal(run(Half(), FrameSkip(3)), after)
+    assert not torch.equal(run(FrameSkip(3)), after)
 
 
 def test_torchrls_own_takes_one_reward_only(make_env):

@@ -229,6 +229,24 @@ def test_pictures(tmp_path):
         policy(pixels / 255)
     with pytest.raises(ValueError, match=r"observation must have dtype torch.uint8, got torch.flo"):
         policy.actor.module(torch.from_numpy(pixels / 255))
+    np.testing.assert_array_equal(policy(pixels.tolist()), policy(pixels))
+    for wide in (pixels + np.int64(256), pixels - np.int16(201)):
+        with pytest.raises(ValueError, match="observation must be in the range of uint8, got"):
+            policy(wide)
+
+
+def test_whole_numbers_that_would_wrap_are_refused(tmp_path):
+    actor = TensorDictModule(lambda count: count.float() / 2, ["count"], ["action"])
+    spec = Composite(count=Bounded(0, 10, (1,), dtype=torch.int32))
+    save_policy(tmp_path / "policy.pt", actor, spec)
+    policy = load_policy(tmp_path / "policy.pt")
+    assert policy(np.array([7])).tolist() == [3.5]
+    assert policy.actor.module(torch.tensor([7])).tolist() == [3.5]
+    for act in (policy, lambda count: policy.actor.module(torch.from_numpy(count))):
+        with pytest.raises(
+            ValueError, match=r"observation must be in the range of (torch\.)?int32"
+        ):
+            act(np.array([2**32]))
 
 
 # ---------------------------------------------------------------- in a control loop

@@ -6,7 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import get_args, get_type_hints
+from unittest.mock import Mock
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -159,14 +161,26 @@ def test_resuming_where_no_run_is_says_so(tmp_path, capsys):
     assert said not in capsys.readouterr().out
 
 
-def test_resuming_with_other_settings_is_refused_before_there_is_a_checkpoint(tmp_path):
+def test_resuming_with_other_settings_is_refused_before_there_is_a_checkpoint(
+    tmp_path, monkeypatch
+):
     config = replace(SMALL, out=tmp_path)
-    safe_gym.start(config)
-    safe_gym.start(replace(config, resume=True, eval_episodes=8))
+    with monkeypatch.context() as patch:
+        patch.setattr(safe_gym.Log, "add", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            train(config, progress=False)
+    assert not list(tmp_path.glob("checkpoints/*.torchrl"))
+    safe_gym.check_folder(replace(config, resume=True, eval_episodes=8))
     with pytest.raises(
         ValueError, match=r"the run has other settings: gamma was .* and is now 0.5"
     ):
-        safe_gym.start(replace(config, resume=True, gamma=0.5))
+        safe_gym.check_folder(replace(config, resume=True, gamma=0.5))
+
+
+def test_an_option_that_cannot_be_used_leaves_the_folder_as_it_was(tmp_path):
+    with pytest.raises(gymnasium.error.NameNotFound):
+        main(replace(SMALL, env="sliding:Slidign-v0", out=tmp_path))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_run_of_another_script_is_not_overwritten(tmp_path):

@@ -17,6 +17,7 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
+from torchrl_safe._checks import check_count
 from torchrl_safe._files import UNFINISHED, publish
 
 
@@ -74,12 +75,14 @@ class RunCheckpoints:
             self.folder, keep_last=keep_last, keep_best=("score", "max")
         )
         self._checkpoint = _checkpoint_of(components)
+        self._skipped: list[Path] = []  # What load has warned of: the run goes on from before.
 
     def save(self, step: int, *, score: float | None = None) -> Path:
         """Saves all components.
 
         Args:
-            step (int): how far the run is, in any unit; a later checkpoint has a larger one.
+            step (int): how far the run is, in any unit; a later checkpoint has a larger one. Those
+                that :meth:`load` has skipped are removed.
             score (float, optional): how good it is; the checkpoint with the highest is kept
                 too. Without a score it is not the best.
 
@@ -87,14 +90,23 @@ class RunCheckpoints:
             The file.
 
         Raises:
+            ValueError: if ``step`` is not a whole number, or the folder has checkpoints of later
+                steps: this one would not be the newest.
             OSError: if it could not be written, for example because the disk is full; those
                 before are intact. What a ``state_dict`` raises is raised as it is.
         """
+        check_count(least=0, step=step)
+        path = self.folder / f"checkpoint-{step:012d}.torchrl"
+        later = [file for file in self._files() if file.name > path.name]
+        if foreign := [file.name for file in later if file not in self._skipped]:
+            raise ValueError(
+                f"step must not be less than that of the newest checkpoint, got {step}, and "
+                f"{self.folder} has {foreign[-1]}: load() resumes that run, clear() removes it."
+            )
         parts = self._checkpoint.components
         taken = {name: _Taken(part.state_dict()) for name, part in parts.items()}
         scores = {} if score is None else {"score": score}
         metadata = {"settings": self.settings, **scores}
-        path = self.folder / f"checkpoint-{step:012d}.torchrl"
         unfinished = self.folder / UNFINISHED
         self.folder.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(unfinished, ignore_errors=True)  # Of a process that was killed.
@@ -110,6 +122,8 @@ class RunCheckpoints:
             ) from error
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
+        for file in later:
+            file.unlink()
         self._rotation.prune()
         return path
 
@@ -128,11 +142,12 @@ class RunCheckpoints:
             CheckpointError: if there are checkpoints, but none that can be used; it says of each
                 why not. The components may have changed then.
         """
-        refused = []
+        self._skipped, refused = [], []
         for path in reversed(self._files()):
             try:
                 step = self._load(path, map_location)
             except Exception as error:  # A torn file can raise any error in its readers.
+                self._skipped.append(path)
                 refused.append(f"{path}: {error}")
                 continue
             if refused:

@@ -105,7 +105,8 @@ class Policy:
                 "take policy.actor."
             )
         given = np.asarray(observation)
-        if not np.can_cast(given.dtype, self.observation_dtype, "same_kind"):
+        whole = given.dtype.kind in "iu" and self.observation_dtype.kind in "iu"
+        if not whole and not np.can_cast(given.dtype, self.observation_dtype, "same_kind"):
             raise ValueError(
                 f"observation must have dtype {self.observation_dtype}, got {given.dtype}."
             )
@@ -116,7 +117,9 @@ class Policy:
                 f"observation must have shape ({shape},) or (B, {shape}), got {given.shape}."
             )
         with np.errstate(over="ignore"):  # What is too large becomes infinite.
-            converted = np.array(given, dtype=self.observation_dtype)
+            converted = given.astype(self.observation_dtype)
+        if whole and not (converted == given).all():
+            raise ValueError(f"observation must be in the range of {converted.dtype}, got {given}.")
         if not np.isfinite(converted).all():
             raise ValueError(f"observation must be finite in {converted.dtype}, got {given}.")
         rows = torch.from_numpy(converted)
@@ -386,5 +389,10 @@ class _AnyBatch(torch.nn.Module):
         if not torch.can_cast(observation.dtype, self.dtype):
             raise ValueError(f"observation must have dtype {self.dtype}, got {observation.dtype}.")
         rows = observation.reshape((batch.numel(), *self.shape))
-        action = self.program(rows.to("cpu", self.dtype))
+        converted = rows.to("cpu", self.dtype)
+        if not self.dtype.is_floating_point and (converted != rows.cpu()).any():
+            raise ValueError(
+                f"observation must be in the range of {self.dtype}, got {observation}."
+            )
+        action = self.program(converted)
         return action.reshape((*batch, *action.shape[1:])).to(observation.device)

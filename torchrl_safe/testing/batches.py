@@ -78,8 +78,8 @@ def make_minibatch(num_costs: int = 1, *, seed: int = 1) -> TensorDictBase:
     """Makes data for an on-policy loss: :func:`make_batch`, flat, with advantages and targets.
 
     The reward advantage is standardized and the cost advantages are centred, as
-    ``estimate_advantages`` of our losses leaves them. With the advantages given, a loss computes
-    none.
+    ``estimate_advantages`` leaves them with ``normalize_cost_advantage=False``. With the advantages
+    given, a loss computes none.
 
     Args:
         num_costs (int, optional): number k of costs.

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_safe._checks import check_positive
 from torchrl_safe.objectives import MultiplierUpdater
 from torchrl_safe.testing._losses import require, require_close, require_equal
 
@@ -32,12 +33,14 @@ def check_multiplier_updater(make_updater: MakeUpdater, *, multiplier_init: floa
 
     Raises:
         AssertionError: if one of these does not hold.
+        ValueError: if ``multiplier_init`` is not positive: a kept limit could not lower it.
 
     Examples:
         >>> from functools import partial
         >>> from torchrl_safe.objectives import DualAscent
         >>> check_multiplier_updater(partial(DualAscent, lr=0.1))
     """
+    check_positive(multiplier_init=multiplier_init)
     _check_directions(make_updater, multiplier_init)
     _check_refusals(make_updater, multiplier_init)
     _check_restored(make_updater, multiplier_init)

@@ -11,7 +11,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 # In units of the budget: one that is used up to the last digit is not exceeded by rounding.
-ROUNDING = 1e-5
+ROUNDING = 1e-4
 
 
 class CostTally(Transform, abc.ABC):
@@ -119,7 +119,7 @@ class CostTally(Transform, abc.ABC):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         reset, tally = self._reset_mask(tensordict), tensordict.get(self.out_key, None)
-        if tally is None:  # All rows begin then; those outside a mask are put back by reset.
+        if tally is None:  # All rows begin then.
             tally = self._tally_spec(self.parent.full_reward_spec).zero() + self.start
         elif reset is None:
             tally = torch.full_like(tally, self.start)

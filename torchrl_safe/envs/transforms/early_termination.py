@@ -76,8 +76,7 @@ class EarlyTermination(CostTally):
         super().__init__(
             budget, start=0.0, cost_key=cost_key, reward_key=reward_key, out_key=out_key
         )
-        check_array("termination_reward", termination_reward, ())
-        self.termination_reward = termination_reward
+        self.termination_reward = float(check_array("termination_reward", termination_reward, ()))
         self.terminated_key, self.done_key = unravel_key(terminated_key), unravel_key(done_key)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:

@@ -43,15 +43,22 @@ class FrameSkip(FrameSkipTransform):
         check_count(frame_skip=frame_skip)
         super().__init__(frame_skip)
 
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        # Earlier transforms change the action after this one, and do so in each frame anew.
+        self._asked = tensordict.copy()
+        return tensordict
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if (parent := self.parent) is None:
             raise RuntimeError("FrameSkip repeats the steps of an environment: append it to one.")
+        asked = self._asked.select(*parent.action_keys)
         for _ in range(self.frame_skip - 1):
             over = _is_over(next_tensordict)
             if over.all():
                 break
             # Sums, budgets and counters of earlier transforms go on from the step before.
             before = tensordict.copy().update(next_tensordict.exclude(*parent.reward_keys))
+            before.update(asked)
             after = parent._step(before)
             for key in parent.reward_keys:
                 after.set(key, next_tensordict.get(key) + after.get(key))

@@ -92,8 +92,7 @@ class Saute(CostTally):
             raise ValueError(f"budget must be above 0, got {budget}.")
         if not isinstance(discount, Real) or not 0 < discount <= 1:
             raise ValueError(f"discount must be above 0 and at most 1, got {discount!r}.")
-        check_array("unsafe_reward", unsafe_reward, ())
-        self.unsafe_reward: float = unsafe_reward
+        self.unsafe_reward: float = float(check_array("unsafe_reward", unsafe_reward, ()))
         self.discount: float = discount
 
     def advance(self, tally: Tensor, cost: Tensor) -> Tensor:
