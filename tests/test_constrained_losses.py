@@ -41,6 +41,7 @@ from torchrl_safe.objectives import (
     TrustRegionLoss,
 )
 from torchrl_safe.objectives._reduction import reduced
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_networks
 
 
@@ -379,6 +380,24 @@ def test_coefficients_are_read_and_set_through_the_wrapper():
     assert (inner.entropy_coeff, inner.critic_coeff) == (0.25, 2.0)
     assert inner.beta == loss.beta == 0.5
     assert not {"beta", "entropy_coeff", "critic_coeff"} & vars(loss).keys()
+
+
+def test_a_constrained_loss_made_of_the_kl_penalty_has_that_penalty():
+    """It reads what the collector's policy has left in the data."""
+
+    class KLPenalized(ConstrainedPPO, KLPENPPOLoss):
+        def policy_losses(self, tensordict, advantage, cost_advantage):
+            return self.unconstrained(tensordict, advantage)
+
+    actor, critic, cost_critic = make_networks()
+    with torch.no_grad():
+        data = actor(make_batch())
+        next(actor.parameters()).add_(0.1)
+    wrapped = LagrangianLoss(KLPENPPOLoss(actor, critic), cost_critic)
+    expected = wrapped(wrapped.estimate_advantages(data.clone()))
+    assert (expected["kl"] > 0).all()
+    loss = KLPenalized(actor, critic, cost_critic)
+    assert torch.equal(loss(loss.estimate_advantages(data.clone()))["kl"], expected["kl"])
 
 
 def test_plain_options_are_set_in_the_wrapped_loss():

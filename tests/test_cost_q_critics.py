@@ -27,6 +27,7 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from torchrl_safe.objectives import (
+    CostGAE,
     CostTD0,
     DualAscent,
     PIDControl,
@@ -700,3 +701,12 @@ def test_batch_of_rows_and_time_equals_the_flat_one(kind):
 def test_compiles_to_one_graph_that_sees_the_multiplier_move():
     make, _, setting = make_kind(TD3LagrangianLoss)
     check_compile(make, **setting)
+
+
+@each_loss
+def test_advantages_are_no_values_of_actions(kind):
+    estimator = CostGAE(gamma=0.9, lmbda=0.9, value_network=None)
+    with pytest.raises(
+        ValueError, match=r"estimator must estimate the value of an action, .* CostGAE"
+    ):
+        make_loss(kind).make_cost_value_estimator(estimator)

@@ -108,3 +108,9 @@ def test_widths_must_agree():
     batch["next", "cost"] = torch.zeros(3, 2)
     with pytest.raises(ValueError, match=r"'cost' and its value .* shapes \(3, 2\) and \(3, 3\)"):
         CostTD0(gamma=0.5).value_estimate(batch)
+
+
+@pytest.mark.parametrize("name", ["average_rewards", "group_key"])
+def test_costs_keep_their_unit(name):
+    with pytest.raises(ValueError, match=f"{name} is not supported by CostTD0"):
+        CostTD0(gamma=0.9, **{name: True})

@@ -30,6 +30,7 @@ from torchrl.modules import (
     TruncatedNormal,
 )
 from torchrl.objectives import ClipPPOLoss, PPOLoss, SoftUpdate
+from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives import (
     CUPLoss,
@@ -319,6 +320,24 @@ def test_costs_without_discount_are_refused():
 
 
 @pytest.mark.parametrize("kind", [P3OLoss, IPOLoss])
+def test_the_cost_advantage_keeps_its_unit(kind):
+    """It is compared with the violation."""
+    standardizing = GAE(gamma=0.9, lmbda=0.9, value_network=None, average_gae=True)
+    with pytest.raises(ValueError, match="estimator must not have average_gae=True"):
+        build(kind).make_cost_value_estimator(standardizing)
+
+
+@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss])
+def test_the_penalty_is_of_the_mean_whatever_is_reduced_how(kind):
+    loss = build(kind)
+    data = estimated(loss)
+    step(loss, [-0.01])
+    expected = loss(data)["loss_penalty"]
+    loss.reduction = "sum"
+    assert torch.equal(loss(data)["loss_penalty"], expected)
+
+
+@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss])
 def test_without_discount_the_length_of_an_episode_must_be_given(kind):
     with pytest.raises(ValueError, match=r"episode_length must be given.*gamma 1\.0"):
         build(kind).make_cost_value_estimator(gamma=1.0)
@@ -327,7 +346,7 @@ def test_without_discount_the_length_of_an_episode_must_be_given(kind):
     data = estimated(loss)
     step(loss, [1.0])
     assert loss(data)["loss_penalty"] > 0
-    for value in (0, -1.0, float("nan"), "long"):
+    for value in (0, 0.5, -1.0, float("nan"), "long"):
         with pytest.raises(ValueError, match=rf"episode_length.*{value}"):
             build(kind, episode_length=value)
 

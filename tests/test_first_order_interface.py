@@ -225,6 +225,8 @@ def test_an_argument_that_does_not_exist_is_refused(make):
     """TorchRL's PPOLoss would ignore it, a limit too."""
     with pytest.raises(TypeError, match=r"unexpected arguments: clip_epsilom, cost_limit"):
         make(*make_networks(), cost_limit=25.0, clip_epsilom=0.1)
+    with pytest.raises(TypeError, match=r"unexpected arguments: kwargs"):
+        make(*make_networks(), kwargs={"clip_epsilon": 0.1})
 
 
 @every_loss

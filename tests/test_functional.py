@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 
-from torchrl_safe.objectives import penalized_advantage
+from torchrl_safe.objectives import penalized_advantage, scaled_advantages
 
 
 def test_one_cost_by_hand():
@@ -73,3 +73,20 @@ def test_advantage_and_cost_must_agree(advantage, cost_advantage):
     named = f"{re.escape(str(advantage))}.*{re.escape(str(cost_advantage))}"
     with pytest.raises(ValueError, match=named):
         penalized_advantage(torch.zeros(advantage), torch.zeros(cost_advantage), torch.zeros(2))
+
+
+@pytest.mark.parametrize("masked", [False, True], ids=["all", "masked"])
+@pytest.mark.parametrize("unit", [2.0**-60, 2.0**-20, 2.0**60], ids=["tiny", "small", "large"])
+def test_the_unit_of_the_reward_does_not_matter(unit, masked):
+    torch.manual_seed(0)
+    advantage, cost_advantage = torch.randn(50, 1), torch.randn(50, 2)
+    counted = torch.rand(50, 1) > 0.2 if masked else None
+    expected, _ = scaled_advantages(advantage, cost_advantage, counted=counted)
+    scaled, _ = scaled_advantages(unit * advantage, cost_advantage, counted=counted)
+    torch.testing.assert_close(scaled, expected)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, 1e6])
+def test_an_advantage_that_is_always_the_same_stays_small(value):
+    scaled, _ = scaled_advantages(torch.full((50, 1), value), torch.zeros(50, 1))
+    assert scaled.abs().max() < 0.2  # The rounding of the mean.

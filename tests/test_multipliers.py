@@ -530,6 +530,29 @@ def test_the_state_of_another_optimizer_changes_nothing(adam):
     assert_unchanged(adam, before)
 
 
+def test_a_state_in_memory_stays_as_it_was(adam):
+    state = adam.state_dict()
+    before = copy.deepcopy(state)
+    adam.step(episodes(3.0, 3.0))
+    torch.testing.assert_close(state, before, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("rule", [PIDControl, partial(DualAscent, lr=0.1, normalize=True)])
+def test_negative_costs_lower_the_multiplier_under_a_limit_of_zero(rule):
+    module = make_module(1.0)
+    rule(module, cost_limit=0.0).step(torch.tensor([[-1.0], [-1.0]]))
+    assert module.lagrange_multiplier < 1
+
+
+def test_limits_and_multipliers_are_no_part_of_a_graph():
+    parameter = torch.nn.Parameter(torch.tensor(1.0))
+    loss = make_loss(multiplier_init=parameter)
+    updater = DualAscent(loss, cost_limit=parameter, lr=0.1)
+    assert not loss.lagrange_multiplier.requires_grad
+    assert not updater.cost_limit.requires_grad
+    copy.deepcopy(loss)
+
+
 def test_the_state_holds_its_own_limit():
     updater = DualAscent(make_module(0.0), cost_limit=1.0, lr=0.1)
     state = updater.state_dict()

@@ -87,6 +87,9 @@ def test_done_states_can_be_skipped(shape):
     drawn, _ = loss._draw_action(following[~done])
     assert torch.equal(action[~done], drawn)
     assert loss(batch)["loss_cost_qvalue"].isfinite()
+    # As TorchRL's SACLoss, which takes a batch without the flag.
+    del batch["next", "done"]
+    assert loss(batch)["loss_cost_qvalue"].isfinite()
 
 
 @pytest.fixture

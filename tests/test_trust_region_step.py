@@ -537,3 +537,8 @@ def test_the_divergence_of_a_very_small_step_is_kept_to():
         kl = kl_divergence(old, loss.actor_network.get_dist(data.double())).mean()
     assert 0 < kl <= 1e-10
     torch.testing.assert_close(info["kl"].double(), kl, rtol=1e-5, atol=0)
+
+
+def test_a_compiled_loss_is_the_loss_itself():
+    loss = make_loss()
+    assert TrustRegionStep(torch.compile(loss, backend="eager"), CPO()).loss_module is loss

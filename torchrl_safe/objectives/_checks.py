@@ -49,10 +49,13 @@ def check_discount(gamma: Tensor) -> None:
 
 
 def check_episode_length(episode_length: float | None) -> float | None:
-    """Returns the value; raises ValueError unless it is positive or None."""
+    """Returns the value; raises ValueError unless it is at least one step, or None."""
     if episode_length is None:
         return None
-    return check_number("episode_length", episode_length, positive=True)
+    length = check_number("episode_length", episode_length, positive=True)
+    if length < 1:
+        raise ValueError(f"episode_length must be at least 1, got {episode_length!r}.")
+    return length
 
 
 def check_length_known(episode_length: float | None, gamma: Tensor) -> None:
@@ -77,6 +80,6 @@ def as_number(value: Any) -> float:
 def as_tensor(name: str, values: Any, dtype: torch.dtype) -> Tensor:
     """Returns one or more numbers as a tensor; raises ValueError if they are none."""
     try:
-        return torch.as_tensor(values, dtype=dtype)
+        return torch.as_tensor(values, dtype=dtype).detach()
     except (OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"{name} must be numbers, got {values!r}.") from error

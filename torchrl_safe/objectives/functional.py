@@ -131,16 +131,20 @@ def standardized(
     """Brings values to mean 0 and standard deviation 1, over those that count.
 
     As TorchRL's ``normalize_advantage``: the deviation of a masked batch is divided by its count.
+    A deviation below a millionth of the largest value counts as rounding.
     """
     excluded = {dim % values.ndim for dim in exclude_dims}
     dims = tuple(dim for dim in range(values.ndim) if dim not in excluded)
+    of_counted = values if counted is None else torch.where(counted, values, 0.0)
+    tiny = torch.finfo(values.dtype).tiny
+    floor = (1e-6 * of_counted.abs().amax(dims, keepdim=True)).clamp_min(tiny)
     if counted is None:
-        scale = values.std(dims, keepdim=True).clamp_min(1e-6)
+        scale = values.std(dims, keepdim=True).maximum(floor)
         return (values - values.mean(dims, keepdim=True)) / scale
     count = counted.expand_as(values).sum(dims, keepdim=True).clamp_min(1)
-    mean = torch.where(counted, values, 0.0).sum(dims, keepdim=True) / count
+    mean = of_counted.sum(dims, keepdim=True) / count
     square = torch.where(counted, values - mean, 0.0).square().sum(dims, keepdim=True)
-    return (values - mean) / (square / count).sqrt().clamp_min(1e-4)
+    return (values - mean) / (square / count).sqrt().maximum(floor)
 
 
 def centred(values: Tensor, counted: Tensor | None = None) -> Tensor:

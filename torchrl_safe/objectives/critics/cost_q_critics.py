@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictPara
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
-from torchrl.objectives.value import ValueEstimatorBase
+from torchrl.objectives.value import GAE, ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
 from torchrl_safe.objectives.critics.cost_td0 import CostTD0
@@ -88,6 +88,13 @@ class CostCriticsMixin(CostValues):
     def _default_cost_estimator(self, **hyperparams: Any) -> ValueEstimatorBase:
         device = self.lagrange_multiplier.device
         return CostTD0(**{"gamma": 0.99, "device": device, **hyperparams})
+
+    def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
+        if isinstance(estimator, GAE):
+            raise ValueError(
+                "estimator must estimate the value of an action, as CostTD0 does, got "
+                f"{type(estimator).__name__}."
+            )
 
     def _cost_estimator_keys(self) -> dict[str, NestedKey]:
         return {

@@ -67,6 +67,12 @@ class CostTD0(TD0Estimator):
     default_keys = _AcceptedKeys
 
     def __init__(self, *, gamma: float, value_network: Any = None, **kwargs: Any) -> None:
+        for name in ("average_rewards", "group_key"):
+            if kwargs.pop(name, None):
+                raise ValueError(
+                    f"{name} is not supported by CostTD0: costs keep their unit, in which "
+                    "their limits are."
+                )
         super().__init__(gamma=check_share("gamma", gamma), value_network=value_network, **kwargs)
 
     def value_estimate(

@@ -152,9 +152,10 @@ class SACLagrangianLoss(CostCriticsMixin, SACLoss):
             return compute_rsample_log_prob(self.actor_network.get_dist(tensordict))
 
     def _draw_next_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        if not self.skip_done_states:
+        done = tensordict.get(self.tensor_keys.done, None)
+        if done is None or not self.skip_done_states:
             return self._draw_action(tensordict)
-        kept = ~tensordict.get(self.tensor_keys.done).squeeze(-1)
+        kept = ~done.squeeze(-1)
         draws = self._draw_action(tensordict[kept])
         action, log_prob = (
             draw.new_zeros((*kept.shape, *draw.shape[1:])).index_put((kept,), draw)

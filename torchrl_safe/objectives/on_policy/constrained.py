@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from inspect import signature
+from inspect import Parameter, signature
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -191,17 +191,17 @@ class ConstrainedPPO(ConstrainedLoss):
     @classmethod
     def _check_arguments(cls, kwargs: Mapping[str, Any]) -> None:
         """Refuses what no constructor takes: TorchRL's would ignore it."""
-        constructors = [
-            base.__dict__["__init__"] for base in cls.__mro__ if "__init__" in vars(base)
-        ]
-        known = {name for each in constructors for name in signature(each).parameters}
+        constructors = [vars(base)["__init__"] for base in cls.__mro__ if "__init__" in vars(base)]
+        parameters = [each for init in constructors for each in signature(init).parameters.values()]
+        catch_all = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
+        known = {each.name for each in parameters if each.kind not in catch_all}
         if unknown := sorted(kwargs.keys() - known):
             raise TypeError(f"{cls.__name__} got unexpected arguments: {', '.join(unknown)}.")
 
     def evaluate(self, tensordict: TensorDictBase) -> Policy:
-        """The present policy. What its modules write stays in the data, where heads find it."""
+        """The present policy. What critics read of it is in the data then."""
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
-        return evaluate(self, tensordict, cost_advantage.shape[:-1])
+        return evaluate(self, tensordict, cost_advantage.shape[:-1], self._shared_keys)
 
     def unconstrained(
         self, tensordict: TensorDictBase, advantage: Tensor, policy: Policy | None = None
@@ -239,10 +239,23 @@ class _Evaluated:
         return advantage
 
 
-def evaluate(loss: PPOLoss, tensordict: TensorDictBase, shape: torch.Size) -> Policy:
-    """The present policy of a PPO loss; ``shape`` is that of the states."""
+def evaluate(
+    loss: PPOLoss, tensordict: TensorDictBase, shape: torch.Size, kept: Sequence[NestedKey] = ()
+) -> Policy:
+    """The present policy of a PPO loss.
+
+    Args:
+        loss: the loss.
+        tensordict: the states, of this shape. What the collector's policy has left stays there:
+            KLPENPPOLoss reads it.
+        shape: the shape of the states.
+        kept: which of the entries that the policy writes are to be in the data.
+    """
+    data = tensordict.clone(False)
     # TorchRL's one place for composite actions, the proximal policy and the cap of the ratio.
-    return Policy(*loss._log_weight(tensordict, adv_shape=shape))
+    policy = Policy(*loss._log_weight(data, adv_shape=shape))
+    tensordict.update(data.select(*kept))
+    return policy
 
 
 def forward_evaluated(loss: PPOLoss, tensordict: TensorDictBase, policy: Policy) -> TensorDictBase:

@@ -19,7 +19,7 @@ from torchrl_safe.objectives._checks import check_discount
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.critics.cost_values import get_or_raise
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
-from torchrl_safe.objectives.on_policy.policies import divergence
+from torchrl_safe.objectives.on_policy.policies import actor_params, divergence
 
 
 def projection_objective(
@@ -149,13 +149,8 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             **kwargs,
         )
         self.improved_actor_params = TensorDictParams(
-            self._actor_params().data.clone(), no_convert=True
+            actor_params(self).data.clone(), no_convert=True
         )
-
-    def _actor_params(self) -> TensorDictBase:
-        if self.functional:
-            return self.actor_network_params
-        return TensorDict.from_module(self.actor_network)
 
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
@@ -164,7 +159,7 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
 
     def start_projection(self) -> None:
         """Keeps the policy as it is now, for :meth:`projection_loss` to stay near it."""
-        kept, present = self.improved_actor_params.data, self._actor_params().data
+        kept, present = self.improved_actor_params.data, actor_params(self).data
         if any(kept[key].shape != value.shape for key, value in present.items(True, True)):
             # A lazy actor has got its shapes since.
             self.improved_actor_params = TensorDictParams(present.clone(), no_convert=True)

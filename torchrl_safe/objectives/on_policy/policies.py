@@ -33,9 +33,6 @@ class ActorCopy:
         self._actor = loss.actor_network
         # A functional loss keeps its actor without parameters.
         self._options = {"preserve_module_state": False} if loss.functional else {}
-        source = loss.actor_network_params
-        if not loss.functional:
-            source = TensorDict.from_module(loss.actor_network)
         copies: dict[int, Tensor] = {}
 
         def copy(tensor: Tensor) -> Tensor:
@@ -44,7 +41,7 @@ class ActorCopy:
                 copies[id(tensor)].requires_grad_(tensor.requires_grad)
             return copies[id(tensor)]
 
-        self._copies = source.apply(copy)
+        self._copies = actor_params(loss).apply(copy)
         self._originals = actor_parameters(loss)
         self.parameters = [copies[id(parameter)] for parameter in self._originals]
         self._start = [parameter.detach().clone() for parameter in self.parameters]
@@ -75,6 +72,13 @@ class ActorCopy:
         """Moves the actor to the copy, in place: all that shares its memory sees it."""
         for original, parameter in zip(self._originals, self.parameters, strict=True):
             original.copy_(parameter)
+
+
+def actor_params(loss: PPOLoss) -> TensorDictBase:
+    """Parameters and buffers of the actor."""
+    if loss.functional:
+        return loss.actor_network_params
+    return TensorDict.from_module(loss.actor_network)
 
 
 def actor_parameters(loss: PPOLoss) -> list[Tensor]:

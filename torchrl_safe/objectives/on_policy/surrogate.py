@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives.value import ValueEstimatorBase
+from torchrl.objectives.value import GAE, ValueEstimatorBase
 
 from torchrl_safe.objectives._checks import check_episode_length, check_length_known
 from torchrl_safe.objectives._reduction import reduced
@@ -98,7 +98,13 @@ class CostSurrogate(ConstrainedPPO):
             ((-low).log1p(), high.log1p()),
             0.0 if joint.log_correction is None else joint.log_correction,
         )
-        return torch.stack([reduced(self, column, tensordict) for column in surrogate.unbind(-1)])
+        columns = surrogate.unbind(-1)
+        return torch.stack([reduced(self, each, tensordict, reduction="mean") for each in columns])
 
     def _check_cost_value_estimator(self, estimator: ValueEstimatorBase) -> None:
         check_length_known(self.episode_length, estimator.gamma)
+        if isinstance(estimator, GAE) and estimator.average_gae:
+            raise ValueError(
+                "estimator must not have average_gae=True: the cost advantage is compared with a "
+                "violation, in the unit of the cost."
+            )

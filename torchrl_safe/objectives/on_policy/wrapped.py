@@ -58,11 +58,7 @@ class WrappedLoss(LossModule):
         loss, shared = self.loss_module, self._shared_keys
         tensordict.set(loss.tensor_keys.advantage, advantage)
         if shared and isinstance(loss, PPOLoss):
-            # Heads read what one evaluation of the policy leaves; KLPENPPOLoss reads what the
-            # collector has left of it.
-            data = tensordict.clone(False)
-            policy = evaluate(loss, data, advantage.shape[:-1])
-            tensordict.update(data.select(*shared))
+            policy = evaluate(loss, tensordict, advantage.shape[:-1], shared)
             return forward_evaluated(loss, tensordict.clone(False), policy)
         losses = loss(tensordict.clone(False))
         tensordict.update(self.actor_features(tensordict))

@@ -125,7 +125,7 @@ class MultiplierUpdater(CostUpdater):
         if len(episode_cost) > 1:
             scale = torch.maximum(scale, episode_cost.std(0))
         # Under a limit of 0 costs that are all the same have no other scale.
-        scale = torch.where(scale > 0, scale, episode_cost.mean(0))
+        scale = torch.where(scale > 0, scale, episode_cost.mean(0).abs())
         # An infinite scale would never be forgotten.
         return scale.clamp_max(torch.finfo(scale.dtype).max)
 
@@ -260,7 +260,7 @@ class DualAscent(MultiplierUpdater):
         return self.parametrization(self._parameter).to(multiplier)
 
     def state_dict(self) -> dict[str, Any]:
-        return {**super().state_dict(), "optimizer": self.optimizer.state_dict()}
+        return {**super().state_dict(), "optimizer": copy.deepcopy(self.optimizer.state_dict())}
 
     def _check_state(self, state_dict: dict[str, Any]) -> None:
         super()._check_state(state_dict)

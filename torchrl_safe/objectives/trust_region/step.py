@@ -19,6 +19,7 @@ from torchrl_safe.objectives._checks import (
     check_episode_length,
     check_length_known,
     check_number,
+    uncompiled,
 )
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.critics.cost_values import get_or_raise
@@ -157,6 +158,7 @@ class TrustRegionStep:
         max_backtracks: int = 10,
         dtype: torch.dtype = torch.float64,
     ) -> None:
+        loss_module = uncompiled(loss_module)
         _check_loss(loss_module, method)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             raise ValueError(f"dtype must be a floating-point torch.dtype, got {dtype!r}.")
