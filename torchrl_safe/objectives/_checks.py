@@ -83,3 +83,21 @@ def as_tensor(name: str, values: Any, dtype: torch.dtype) -> Tensor:
         return torch.as_tensor(values, dtype=dtype).detach()
     except (OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"{name} must be numbers, got {values!r}.") from error
+
+
+def check_columns(cost_advantage: Tensor, kind: str, values: Tensor) -> None:
+    """Raises ValueError unless there is one column of shape ``(*B, k)`` for each of k values."""
+    if values.ndim != 1 or cost_advantage.shape[-1:] != values.shape:
+        raise ValueError(
+            f"cost_advantage must have one column for each {kind}, got cost_advantage of shape "
+            f"{tuple(cost_advantage.shape)} and {kind}s of shape {tuple(values.shape)}."
+        )
+
+
+def check_rows(advantage: Tensor, cost_advantage: Tensor) -> None:
+    """Raises ValueError unless the shapes are ``(*B, 1)`` and ``(*B, k)``."""
+    if advantage.shape != (*cost_advantage.shape[:-1], 1):
+        raise ValueError(
+            "advantage must have shape (*B, 1) and cost_advantage (*B, k) with the same *B, got "
+            f"{tuple(advantage.shape)} and {tuple(cost_advantage.shape)}."
+        )

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchrl_safe.objectives._checks import check_columns, check_rows
+
 
 def scaled_advantages(
     advantage: Tensor,
@@ -194,17 +196,8 @@ def penalized_advantage(
         tensor([[-1.],
                 [ 2.]])
     """
-    if lagrange_multiplier.ndim != 1 or cost_advantage.shape[-1:] != lagrange_multiplier.shape:
-        raise ValueError(
-            "cost_advantage must have one column for each multiplier, got cost_advantage of shape "
-            f"{tuple(cost_advantage.shape)} and lagrange_multiplier of shape "
-            f"{tuple(lagrange_multiplier.shape)}."
-        )
-    if advantage.shape != (*cost_advantage.shape[:-1], 1):
-        raise ValueError(
-            "advantage must have shape (*B, 1) and cost_advantage (*B, k) with the same *B, got "
-            f"{tuple(advantage.shape)} and {tuple(cost_advantage.shape)}."
-        )
+    check_columns(cost_advantage, "multiplier", lagrange_multiplier)
+    check_rows(advantage, cost_advantage)
     penalized = advantage - (lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
     return penalized / (1 + lagrange_multiplier.sum()) if rescale else penalized
 

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._checks import check_number
+from torchrl_safe.objectives._checks import check_columns, check_number, check_rows
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedLoss
 from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
 
@@ -49,16 +49,8 @@ def rectified_advantage(
         tensor([[-4.],
                 [-6.]])
     """
-    if cost_advantage.shape[-1:] != violation.shape:
-        raise ValueError(
-            "cost_advantage must have one column for each violation, got cost_advantage of shape "
-            f"{tuple(cost_advantage.shape)} and violation of shape {tuple(violation.shape)}."
-        )
-    if advantage.shape != (*cost_advantage.shape[:-1], 1):
-        raise ValueError(
-            "advantage must have shape (*B, 1) and cost_advantage (*B, k) with the same *B, got "
-            f"{tuple(advantage.shape)} and {tuple(cost_advantage.shape)}."
-        )
+    check_columns(cost_advantage, "violation", violation)
+    check_rows(advantage, cost_advantage)
     worst = cost_advantage.index_select(-1, violation.argmax().reshape(1))
     return torch.where(violation.max() > tolerance, -worst, advantage)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE, ValueEstimatorBase
 
-from torchrl_safe.objectives._checks import check_discount
+from torchrl_safe.objectives._checks import check_columns, check_discount
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.critics.cost_values import get_or_raise
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
@@ -50,12 +50,7 @@ def projection_objective(
     Raises:
         ValueError: if there is not one advantage for each multiplier.
     """
-    if cost_advantage.shape[-1:] != lagrange_multiplier.shape:
-        raise ValueError(
-            "cost_advantage must have one column for each multiplier, got cost_advantage of shape "
-            f"{tuple(cost_advantage.shape)} and lagrange_multiplier of shape "
-            f"{tuple(lagrange_multiplier.shape)}."
-        )
+    check_columns(cost_advantage, "multiplier", lagrange_multiplier)
     cost = (lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
     return kl + scale * ratio * cost
 
