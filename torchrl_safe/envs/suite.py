@@ -1,6 +1,7 @@
 """Ten tasks, each with costs and a limit for each of them: the benchmark of this library, as data.
 
-Every arm, task, layout of obstacles and kind of action is in one of them, and five have two or more limits.
+Every arm, task, layout of obstacles and kind of action is in one of them, and five have two or
+more limits.
 """
 
 from __future__ import annotations
