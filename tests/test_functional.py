@@ -90,3 +90,13 @@ def test_the_unit_of_the_reward_does_not_matter(unit, masked):
 def test_an_advantage_that_is_always_the_same_stays_small(value):
     scaled, _ = scaled_advantages(torch.full((50, 1), value), torch.zeros(50, 1))
     assert scaled.abs().max() < 0.2  # The rounding of the mean.
+
+
+@pytest.mark.parametrize("masked", [False, True], ids=["all", "masked"])
+def test_advantages_whose_squares_are_zero_stay_small(masked):
+    torch.manual_seed(0)
+    counted = torch.rand(50, 1) > 0.2 if masked else None
+    scaled, _ = scaled_advantages(
+        2.0**-80 * torch.randn(50, 1), torch.zeros(50, 1), counted=counted
+    )
+    assert scaled.abs().max() < 1

@@ -138,8 +138,9 @@ def standardized(
     excluded = {dim % values.ndim for dim in exclude_dims}
     dims = tuple(dim for dim in range(values.ndim) if dim not in excluded)
     of_counted = values if counted is None else torch.where(counted, values, 0.0)
-    tiny = torch.finfo(values.dtype).tiny
-    floor = (1e-6 * of_counted.abs().amax(dims, keepdim=True)).clamp_min(tiny)
+    # The squares of less are 0, and so would the deviation be.
+    least = torch.finfo(values.dtype).tiny ** 0.5
+    floor = (1e-6 * of_counted.abs().amax(dims, keepdim=True)).clamp_min(least)
     if counted is None:
         scale = values.std(dims, keepdim=True).maximum(floor)
         return (values - values.mean(dims, keepdim=True)) / scale
