@@ -75,7 +75,8 @@ class RunCheckpoints:
             self.folder, keep_last=keep_last, keep_best=("score", "max")
         )
         self._checkpoint = _checkpoint_of(components)
-        self._skipped: list[Path] = []  # What load has warned of: the run goes on from before.
+        # What load has warned of, and why: the run goes on from before.
+        self._skipped: dict[Path, str] = {}
 
     def save(self, step: int, *, score: float | None = None) -> Path:
         """Saves all components.
@@ -95,7 +96,7 @@ class RunCheckpoints:
             OSError: if it could not be written, for example because the disk is full; those
                 before are intact. What a ``state_dict`` raises is raised as it is.
         """
-        check_count(least=0, step=step)
+        check_count(least=0, below=10**12, step=step)  # The digits that the name has.
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
         later = [file for file in self._files() if file.name > path.name]
         if foreign := [file.name for file in later if file not in self._skipped]:
@@ -142,20 +143,19 @@ class RunCheckpoints:
             CheckpointError: if there are checkpoints, but none that can be used; it says of each
                 why not. The components may have changed then.
         """
-        self._skipped, refused = [], []
+        self._skipped = {}
         for path in reversed(self._files()):
             try:
                 step = self._load(path, map_location)
             except Exception as error:  # A torn file can raise any error in its readers.
-                self._skipped.append(path)
-                refused.append(f"{path}: {error}")
+                self._skipped[path] = f"{path}: {error}"
                 continue
-            if refused:
-                reasons = "\n".join(refused)
+            if self._skipped:
+                reasons = "\n".join(self._skipped.values())
                 warnings.warn(f"Going on from {path}; not used:\n{reasons}", stacklevel=2)
             return step
-        if refused:
-            reasons = "\n".join(refused)
+        if self._skipped:
+            reasons = "\n".join(self._skipped.values())
             raise CheckpointError(f"No checkpoint in {self.folder} can be used:\n{reasons}")
         return None
 
