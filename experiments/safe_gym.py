@@ -447,7 +447,7 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     # Environment and learner could be made: only now the folder is this run's.
     config.out.mkdir(parents=True, exist_ok=True)
     if not (results := config.out / "results.json").exists():
-        write_whole(results, json.dumps({"config": dataclasses.asdict(config)}, default=str))
+        write_whole(results, json.dumps({"config": as_json(config)}))
     if config.resume:
         checkpoints.load()
     else:

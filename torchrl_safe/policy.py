@@ -105,8 +105,10 @@ class Policy:
                 "take policy.actor."
             )
         given = np.asarray(observation)
+        # Whole numbers may fit in a smaller type; where a type holds all of them, they do.
         whole = given.dtype.kind in "iu" and self.observation_dtype.kind in "iu"
-        if not whole and not np.can_cast(given.dtype, self.observation_dtype, "same_kind"):
+        narrowed = whole and not np.can_cast(given.dtype, self.observation_dtype)
+        if not narrowed and not np.can_cast(given.dtype, self.observation_dtype, "same_kind"):
             raise ValueError(
                 f"observation must have dtype {self.observation_dtype}, got {given.dtype}."
             )
@@ -118,7 +120,7 @@ class Policy:
             )
         with np.errstate(over="ignore"):  # What is too large becomes infinite.
             converted = given.astype(self.observation_dtype)
-        if whole and not (converted == given).all():
+        if narrowed and not (converted == given).all():
             raise ValueError(f"observation must be in the range of {converted.dtype}, got {given}.")
         if not np.isfinite(converted).all():
             raise ValueError(f"observation must be finite in {converted.dtype}, got {given}.")
@@ -390,7 +392,8 @@ class _AnyBatch(torch.nn.Module):
             raise ValueError(f"observation must have dtype {self.dtype}, got {observation.dtype}.")
         rows = observation.reshape((batch.numel(), *self.shape))
         converted = rows.to("cpu", self.dtype)
-        if not self.dtype.is_floating_point and (converted != rows.cpu()).any():
+        narrowed = torch.promote_types(rows.dtype, self.dtype) != self.dtype
+        if narrowed and not self.dtype.is_floating_point and (converted != rows.cpu()).any():
             raise ValueError(
                 f"observation must be in the range of {self.dtype}, got {observation}."
             )

@@ -85,6 +85,13 @@ def as_tensor(name: str, values: Any, dtype: torch.dtype) -> Tensor:
         raise ValueError(f"{name} must be numbers, got {values!r}.") from error
 
 
+def refuse_options(owner: str, options: dict[str, Any], *names: str, reason: str) -> None:
+    """Takes options off that are not set; raises ValueError for one that is."""
+    for name in names:
+        if options.pop(name, None):
+            raise ValueError(f"{name} is not supported by {owner}: {reason}.")
+
+
 def check_columns(cost_advantage: Tensor, kind: str, values: Tensor) -> None:
     """Raises ValueError unless there is one column of shape ``(*B, k)`` for each of k values."""
     if values.ndim != 1 or cost_advantage.shape[-1:] != values.shape:

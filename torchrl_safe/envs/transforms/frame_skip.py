@@ -58,8 +58,7 @@ class FrameSkip(FrameSkipTransform):
                 break
             # Sums, budgets and counters of earlier transforms go on from the step before.
             before = tensordict.copy().update(next_tensordict.exclude(*parent.reward_keys))
-            before.update(asked)
-            after = parent._step(before)
+            after = parent._step(before.update(asked))
             for key in parent.reward_keys:
                 after.set(key, next_tensordict.get(key) + after.get(key))
             next_tensordict = next_tensordict.where(over, after)

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
-from torchrl_safe.objectives._checks import check_share
+from torchrl_safe.objectives._checks import check_share, refuse_options
 
 
 class CostGAE(GAE):
@@ -92,12 +92,8 @@ class CostGAE(GAE):
         vectorized: bool | None = True,
         **kwargs: Any,
     ) -> None:
-        for name in ("average_gae", "group_key"):
-            if kwargs.pop(name, None):
-                raise ValueError(
-                    f"{name} is not supported by CostGAE: scaled_advantages scales advantages, of "
-                    "reward and costs together."
-                )
+        reason = "scaled_advantages scales advantages, of reward and costs together"
+        refuse_options("CostGAE", kwargs, "average_gae", "group_key", reason=reason)
         super().__init__(
             gamma=check_share("gamma", gamma),
             lmbda=check_share("lmbda", lmbda),

@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.value import TD0Estimator
 
-from torchrl_safe.objectives._checks import check_share
+from torchrl_safe.objectives._checks import check_share, refuse_options
 
 
 class CostTD0(TD0Estimator):
@@ -67,12 +67,8 @@ class CostTD0(TD0Estimator):
     default_keys = _AcceptedKeys
 
     def __init__(self, *, gamma: float, value_network: Any = None, **kwargs: Any) -> None:
-        for name in ("average_rewards", "group_key"):
-            if kwargs.pop(name, None):
-                raise ValueError(
-                    f"{name} is not supported by CostTD0: costs keep their unit, in which "
-                    "their limits are."
-                )
+        reason = "costs keep their unit, in which their limits are"
+        refuse_options("CostTD0", kwargs, "average_rewards", "group_key", reason=reason)
         super().__init__(gamma=check_share("gamma", gamma), value_network=value_network, **kwargs)
 
     def value_estimate(
