@@ -259,7 +259,7 @@ def test_what_was_skipped_is_removed_by_the_next_save(run, net):
     assert saved.exists()
 
 
-@pytest.mark.parametrize("step", [-1, 1.5, True])
+@pytest.mark.parametrize("step", [-1, 1.5, True, 10**12])
 def test_steps_are_whole_numbers(run, step):
     with pytest.raises(ValueError, match="step must be a whole number of at least 0, got"):
         run.save(step)

@@ -35,11 +35,11 @@ def check_flag(**values: bool) -> None:
             raise TypeError(f"{name} must be True or False, got {value!r}.")
 
 
-def check_count(*, least: int = 1, below: int = 2**31, **values: Any) -> None:
-    """Raises ValueError unless each value is a whole number, and not too small or large."""
+def check_count(*, least: int = 1, **values: Any) -> None:
+    """Raises ValueError unless each value is a whole number, and not too small."""
     for name, value in values.items():
         try:
-            usable = not isinstance(value, bool) and least <= operator.index(value) < below
+            usable = not isinstance(value, bool) and least <= operator.index(value) < 2**31
         except TypeError:
             usable = False
         if not usable:

@@ -7,6 +7,7 @@ import shutil
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-from torchrl_safe._checks import check_count
 from torchrl_safe._files import UNFINISHED, publish
 
 
@@ -91,12 +91,16 @@ class RunCheckpoints:
             The file.
 
         Raises:
-            ValueError: if ``step`` is not a whole number, or the folder has checkpoints of later
-                steps: this one would not be the newest.
+            ValueError: if ``step`` is not a whole number of at most twelve digits, or the folder
+                has checkpoints of later steps: this one would not be the newest.
             OSError: if it could not be written, for example because the disk is full; those
                 before are intact. What a ``state_dict`` raises is raised as it is.
         """
-        check_count(least=0, below=10**12, step=step)  # The digits that the name has.
+        whole = isinstance(step, Integral) and not isinstance(step, bool)
+        if not whole or not 0 <= step < 10**12:  # The digits that the name has.
+            raise ValueError(
+                f"step must be a whole number of at least 0, got {step!r}; it has 12 digits at most."
+            )
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
         later = [file for file in self._files() if file.name > path.name]
         if foreign := [file.name for file in later if file not in self._skipped]:
