@@ -99,7 +99,7 @@ class RunCheckpoints:
         whole = isinstance(step, Integral) and not isinstance(step, bool)
         if not whole or not 0 <= step < 10**12:  # The digits that the name has.
             raise ValueError(
-                f"step must be a whole number of at least 0, got {step!r}; it has 12 digits at most."
+                f"step must be a whole number of at least 0, got {step!r}, and at most 12 digits."
             )
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
         later = [file for file in self._files() if file.name > path.name]
