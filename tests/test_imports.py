@@ -87,7 +87,7 @@ def test_the_transforms_need_no_simulator():
     [
         ("policy", {"_files", "_program"}),
         ("evaluation", {"_checks", "metrics"}),
-        ("metrics", set()),
+        ("metrics", {"_checks"}),
         ("checkpoint", {"_files"}),
         ("collectors", set()),
     ],

@@ -421,7 +421,7 @@ def test_an_option_that_is_neither_true_nor_false_is_refused():
     """A tensor would be asked for its truth, which it has not."""
     actor, critic, cost_critic = make_networks()
     wrapped = ClipPPOLoss(actor, critic, entropy_bonus=False)
-    with pytest.raises(TypeError, match=r"separate_losses must be a bool, got tensor"):
+    with pytest.raises(TypeError, match=r"separate_losses must be True or False, got tensor"):
         LagrangianLoss(wrapped, cost_critic, separate_losses=torch.zeros(3))
 
 

@@ -33,7 +33,10 @@ ON_POLICY = {
 # Hooks that TorchRL's own GAE of several agents overrides too.
 ESTIMATORS = {"_broadcast_optional", "_prepare_signals"}
 OFF_POLICY = {"_alpha", "_compute_target_v2", "_next_value", "_reduce_loss"}
-OFF_POLICY_FILES = {"cost_q_critics.py", "cost_td0.py", "sac_lagrangian.py", "td3_lagrangian.py"}
+OFF_POLICY_FILES = {
+    *("critics/cost_td0.py", "off_policy/constrained.py"),
+    *("off_policy/sac_lagrangian.py", "off_policy/td3_lagrangian.py"),
+}
 
 
 def is_private(name):
@@ -79,7 +82,7 @@ def used(theirs, *, off_policy):
     """TorchRL's private names by the files of ours that use them."""
     found = {}
     for path in OBJECTIVES.rglob("*.py"):
-        if (path.name in OFF_POLICY_FILES) == off_policy:
+        if (str(path.relative_to(OBJECTIVES)) in OFF_POLICY_FILES) == off_policy:
             for name in theirs & set(used_in(ast.parse(path.read_text()))):
                 found.setdefault(name, set()).add(path.name)
     return found

@@ -148,7 +148,7 @@ def test_crpo_takes_the_same_steps_in_any_unit_of_the_cost(unit):
 def test_losses_that_read_a_violation_keep_the_unit_of_the_cost(make):
     with pytest.raises(TypeError, match="normalize_cost_advantage is not supported"):
         make(*make_networks(), normalize_cost_advantage=True)
-    with pytest.raises(TypeError, match="normalize_cost_advantage must be a bool, got 1"):
+    with pytest.raises(TypeError, match="normalize_cost_advantage must be True or False, got 1"):
         make_loss(normalize_cost_advantage=1)
 
 

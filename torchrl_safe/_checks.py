@@ -9,7 +9,9 @@ from types import UnionType
 from typing import Any, Protocol, get_args
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 _LARGEST = np.finfo(np.float32).max
 
@@ -76,6 +78,23 @@ def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.fl
     if not np.abs(array).max(initial=0) <= _LARGEST:  # NaN is not finite either.
         raise ValueError(f"{name} must be finite, got {array}.")
     return array
+
+
+def as_tensor(name: str, values: Any, dtype: torch.dtype) -> Tensor:
+    """Returns one or more numbers as a tensor; raises ValueError if they are none."""
+    try:
+        return torch.as_tensor(values, dtype=dtype).detach()
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers, got {values!r}.") from error
+
+
+def check_one_each(name: str, values: Tensor, num_costs: int) -> None:
+    """Raises ValueError unless there is one number, or one for each cost."""
+    if values.shape not in ((), (num_costs,)):
+        raise ValueError(
+            f"{name} must be one number or one for each of the {num_costs} costs, got shape "
+            f"{tuple(values.shape)}."
+        )
 
 
 def keep_numbers(part: Any, name: str, count: int) -> NDArray[np.float64]:

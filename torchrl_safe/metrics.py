@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_safe._checks import as_tensor, check_one_each
+
 try:
     from scipy import stats
 except ImportError as error:
@@ -394,15 +396,8 @@ def _by_seed(name: str, values: Tensor) -> Tensor:
 def _limit(cost_limit: float | Tensor, cost: Tensor) -> Tensor:
     # Rounded as the costs are: a float32 cost of 0.1 is not above a limit of 0.1.
     dtype = cost.dtype if cost.is_floating_point() else torch.float64
-    try:
-        limit = torch.as_tensor(cost_limit, dtype=dtype).double().cpu()
-    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"cost_limit must be numbers, got {cost_limit!r}.") from error
-    if limit.shape not in ((), cost.shape[-1:]):
-        raise ValueError(
-            f"cost_limit must be one number or one for each of the {cost.shape[-1]} costs, got "
-            f"shape {tuple(limit.shape)}."
-        )
+    limit = as_tensor("cost_limit", cost_limit, dtype).double().cpu()
+    check_one_each("cost_limit", limit, cost.shape[-1])
     if not limit.isfinite().all():
         raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
     return limit

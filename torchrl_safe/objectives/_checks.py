@@ -7,7 +7,11 @@ from numbers import Real
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
+
+from torchrl_safe._checks import as_tensor, check_one_each
 
 # Losses compute in single precision, also with squares of what is positive, and divide by them.
 _LARGEST = torch.finfo(torch.float32).max
@@ -77,12 +81,25 @@ def as_number(value: Any) -> float:
         return math.nan
 
 
-def as_tensor(name: str, values: Any, dtype: torch.dtype) -> Tensor:
-    """Returns one or more numbers as a tensor; raises ValueError if they are none."""
-    try:
-        return torch.as_tensor(values, dtype=dtype).detach()
-    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers, got {values!r}.") from error
+def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:
+    """The multipliers to start with, shape ``(k,)``, checked."""
+    multiplier = as_tensor("multiplier_init", multiplier_init, torch.get_default_dtype())
+    check_one_each("multiplier_init", multiplier, num_costs)
+    # Near the end of single precision its product with an advantage would be infinite.
+    if not ((multiplier >= 0) & (multiplier <= 1e18)).all():
+        raise ValueError(
+            "multiplier_init must be finite and not negative, and at most 1e18, got "
+            f"{multiplier_init}."
+        )
+    return multiplier.expand(num_costs).clone()
+
+
+def get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """The entry, or an error that names it."""
+    tensor = tensordict.get(key, None)
+    if tensor is None:
+        raise KeyError(f"The key {key!r} was not found in the input tensordict.")
+    return tensor
 
 
 def refuse_options(owner: str, options: dict[str, Any], *names: str, reason: str) -> None:

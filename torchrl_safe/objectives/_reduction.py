@@ -1,4 +1,4 @@
-"""Which steps count in a loss, and the mean or sum over them, as TorchRL's losses have it."""
+"""What a loss returns: the mean or sum over the steps that count, as in TorchRL, and reports."""
 
 from __future__ import annotations
 
@@ -56,3 +56,10 @@ def expanded_mask(mask: Tensor, values: Tensor) -> Tensor:
             f"{tuple(values.shape)}."
         )
     return mask.reshape(*mask.shape, *(1,) * (values.ndim - mask.ndim)).expand_as(values)
+
+
+def report_each(losses: TensorDictBase, name: str, values: Tensor) -> None:
+    """Adds an output for each cost, from a buffer of shape ``(k,)``."""
+    # Scalars, since trainers and loggers keep no others; cloned, since buffers change in place.
+    for index, value in enumerate(values.clone().unbind()):
+        losses.set(f"{name}_{index}", value)

@@ -10,6 +10,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from torchrl_safe._checks import as_tensor, check_one_each
+
 # In units of the budget: one that is used up to the last digit is not exceeded by rounding.
 ROUNDING = 1e-4
 
@@ -40,10 +42,7 @@ class CostTally(Transform, abc.ABC):
         reward_key: NestedKey,
         out_key: NestedKey,
     ) -> None:
-        try:
-            limit = torch.as_tensor(budget, dtype=torch.get_default_dtype())
-        except (OverflowError, RuntimeError, TypeError, ValueError) as error:
-            raise ValueError(f"budget must be numbers, got {budget!r}.") from error
+        limit = as_tensor("budget", budget, torch.get_default_dtype())
         if limit.ndim > 1 or not limit.isfinite().all() or (limit < 0).any():
             raise ValueError(
                 "budget must be one number or one for each cost, finite and not negative, got "
@@ -74,11 +73,7 @@ class CostTally(Transform, abc.ABC):
             if key not in known:
                 raise KeyError(f"{name} must be among the rewards {known}, got {key!r}.")
         spec = rewards[self.cost_key]
-        if self.budget.shape not in ((), spec.shape[-1:]):
-            raise ValueError(
-                f"budget must be one number or one for each of the {spec.shape[-1]} costs, got "
-                f"shape {tuple(self.budget.shape)}."
-            )
+        check_one_each("budget", self.budget, spec.shape[-1])
         check_column("reward_key", self.reward_key, rewards[self.reward_key], spec)
         return Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
 

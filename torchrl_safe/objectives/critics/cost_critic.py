@@ -22,10 +22,10 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
-from torchrl_safe.objectives._checks import check_number
+from torchrl_safe.objectives._checks import check_number, get_or_raise
 from torchrl_safe.objectives._reduction import counted, expanded_mask, reduced
 from torchrl_safe.objectives.critics.cost_gae import CostGAE
-from torchrl_safe.objectives.critics.cost_values import CostValues, get_or_raise
+from torchrl_safe.objectives.critics.cost_values import CostValues
 from torchrl_safe.objectives.functional import scaled_advantages
 
 

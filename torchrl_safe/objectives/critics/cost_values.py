@@ -6,14 +6,10 @@ import abc
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
-
-from torchrl_safe.objectives._checks import as_tensor
 
 Self = TypeVar("Self", bound="CostValues")
 
@@ -134,38 +130,6 @@ class CostValues(LossModule):
     @out_keys.setter
     def out_keys(self, values: list[NestedKey]) -> None:
         self._selected_out_keys = values
-
-
-def get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """The entry, or an error that names it."""
-    tensor = tensordict.get(key, None)
-    if tensor is None:
-        raise KeyError(f"The key {key!r} was not found in the input tensordict.")
-    return tensor
-
-
-def report_each(losses: TensorDictBase, name: str, values: Tensor) -> None:
-    """Adds an output for each cost, from a buffer of shape ``(k,)``."""
-    # Scalars, since trainers and loggers keep no others; cloned, since buffers change in place.
-    for index, value in enumerate(values.clone().unbind()):
-        losses.set(f"{name}_{index}", value)
-
-
-def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:
-    """The multipliers to start with, shape ``(k,)``, checked."""
-    multiplier = as_tensor("multiplier_init", multiplier_init, torch.get_default_dtype())
-    if multiplier.shape not in ((), (num_costs,)):
-        raise ValueError(
-            f"multiplier_init must be one number or one for each of the {num_costs} costs, got "
-            f"shape {tuple(multiplier.shape)}."
-        )
-    # Near the end of single precision its product with an advantage would be infinite.
-    if not ((multiplier >= 0) & (multiplier <= 1e18)).all():
-        raise ValueError(
-            "multiplier_init must be finite and not negative, and at most 1e18, got "
-            f"{multiplier_init}."
-        )
-    return multiplier.expand(num_costs).clone()
 
 
 def _build_value_estimators(loss: CostValues, *_: Any) -> None:

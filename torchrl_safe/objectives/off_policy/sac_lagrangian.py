@@ -19,10 +19,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from torchrl_safe.objectives.critics.cost_q_critics import CostCriticsMixin
+from torchrl_safe.objectives.off_policy.constrained import ConstrainedQLoss
 
 
-class SACLagrangianLoss(CostCriticsMixin, SACLoss):
+class SACLagrangianLoss(ConstrainedQLoss, SACLoss):
     r"""SAC loss under constraints on k expected costs.
 
     Presented in "Learning to Walk in the Real World with Minimal Human Effort", Ha et al. 2020,

@@ -13,10 +13,10 @@ from torchrl.envs.utils import step_mdp
 from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_safe.objectives.critics.cost_q_critics import CostCriticsMixin
+from torchrl_safe.objectives.off_policy.constrained import ConstrainedQLoss
 
 
-class TD3LagrangianLoss(CostCriticsMixin, TD3Loss):
+class TD3LagrangianLoss(ConstrainedQLoss, TD3Loss):
     r"""TD3 loss under constraints on k expected costs.
 
     The actor of "Addressing Function Approximation Error in Actor-Critic Methods", Fujimoto et

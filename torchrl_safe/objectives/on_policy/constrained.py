@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from inspect import Parameter, signature
@@ -20,22 +19,21 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import PPOLoss
 
+from torchrl_safe._checks import check_flag
+from torchrl_safe.objectives._checks import get_or_raise, initial_multiplier
+from torchrl_safe.objectives._reduction import report_each
 from torchrl_safe.objectives.critics.cost_critic import CostCritic, CostKeys
-from torchrl_safe.objectives.critics.cost_values import (
-    get_or_raise,
-    initial_multiplier,
-    report_each,
-)
-from torchrl_safe.objectives.functional import cost_advantage_scale
+from torchrl_safe.objectives.functional import cost_advantage_scale, penalized_advantage
 from torchrl_safe.objectives.on_policy.policies import summed
 
 
 class ConstrainedLoss(CostCritic):
     """A loss of TorchRL for the policy, under constraints on k costs.
 
-    A subclass writes :meth:`policy_losses`: the method, as its paper has it. There it calls
-    ``unconstrained(tensordict, advantage)``, TorchRL's own loss for an advantage, which the class
-    beside this one brings: :class:`ConstrainedPPO` for a parent, ``WrappedLoss`` for an object.
+    :meth:`policy_losses` is the method, as its paper has it: here the mixed advantage, which a
+    subclass may replace. It calls ``unconstrained(tensordict, advantage)``, TorchRL's own loss for
+    an advantage, which the class beside this one brings: :class:`ConstrainedPPO` for a parent,
+    ``WrappedLoss`` for an object.
     """
 
     # What tells the loss of its constraints: buffers of shape (k,) that an updater writes. Each
@@ -62,10 +60,7 @@ class ConstrainedLoss(CostCritic):
         super().__init__(*args, **kwargs)
         if normalize_cost_advantage is None:
             normalize_cost_advantage = not self.keeps_cost_unit
-        if not isinstance(normalize_cost_advantage, bool):
-            raise TypeError(
-                f"normalize_cost_advantage must be a bool, got {normalize_cost_advantage!r}."
-            )
+        check_flag(normalize_cost_advantage=normalize_cost_advantage)
         if normalize_cost_advantage and self.keeps_cost_unit:
             raise TypeError(
                 f"{type(self).__name__} compares the cost advantage with a violation, in the unit "
@@ -91,11 +86,25 @@ class ConstrainedLoss(CostCritic):
         scale = cost_advantage_scale(self.cost_advantage_scale, cost_advantage, mask)
         return self.cost_advantage_scale.copy_(scale)
 
-    @abc.abstractmethod
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
-        """See :meth:`~torchrl_safe.objectives.PPOLagrangianLoss.policy_losses`."""
+        """Returns all outputs but those of the cost critic. A loss of your own overrides it.
+
+        It may call ``self.evaluate(tensordict)``, the present policy of a PPO loss, and
+        ``self.unconstrained(tensordict, advantage)``, the outputs of TorchRL's loss for any
+        advantage of shape ``(*B, 1)``; a PPO loss takes that policy as a third argument.
+
+        Args:
+            tensordict (TensorDictBase): the data, a copy that may be written to.
+            advantage (Tensor): reward advantage, shape ``(*B, 1)``.
+            cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
+
+        Returns:
+            A tensordict of losses named ``"loss_..."``, reduced, and of numbers to log.
+        """
+        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
+        return self.unconstrained(tensordict, mixed)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

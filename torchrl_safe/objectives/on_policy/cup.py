@@ -15,9 +15,8 @@ from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE, ValueEstimatorBase
 
-from torchrl_safe.objectives._checks import check_columns, check_discount
+from torchrl_safe.objectives._checks import check_columns, check_discount, get_or_raise
 from torchrl_safe.objectives._reduction import reduced
-from torchrl_safe.objectives.critics.cost_values import get_or_raise
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 from torchrl_safe.objectives.on_policy.policies import actor_params, divergence
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives.functional import penalized_advantage
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedLoss
 from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
 
@@ -102,9 +100,3 @@ class LagrangianLoss(ConstrainedLoss, WrappedLoss):
             separate_losses=separate_losses,
             normalize_cost_advantage=normalize_cost_advantage,
         )
-
-    def policy_losses(
-        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
-    ) -> TensorDictBase:
-        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
-        return self.unconstrained(tensordict, mixed)

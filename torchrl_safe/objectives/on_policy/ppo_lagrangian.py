@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives.functional import penalized_advantage
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 
 
@@ -75,23 +72,3 @@ class PPOLagrangianLoss(ConstrainedPPO, ClipPPOLoss):
         >>> losses["lagrange_multiplier_0"]
         tensor(0.0200)
     """
-
-    def policy_losses(
-        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
-    ) -> TensorDictBase:
-        """Returns all outputs but those of the cost critic. A loss of your own overrides it.
-
-        It may call ``self.evaluate(tensordict)``, the present policy, and
-        ``self.unconstrained(tensordict, advantage, policy)``, the outputs of ``ClipPPOLoss`` for
-        any advantage of shape ``(*B, 1)``.
-
-        Args:
-            tensordict (TensorDictBase): the data, a copy that may be written to.
-            advantage (Tensor): reward advantage, shape ``(*B, 1)``.
-            cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
-
-        Returns:
-            A tensordict of losses named ``"loss_..."``, reduced, and of numbers to log.
-        """
-        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
-        return self.unconstrained(tensordict, mixed)

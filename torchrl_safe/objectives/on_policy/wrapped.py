@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_safe._checks import check_flag
 from torchrl_safe.objectives.critics.cost_critic import CostCritic, CostKeys
 from torchrl_safe.objectives.on_policy.constrained import evaluate, forward_evaluated
 
@@ -43,8 +44,7 @@ class WrappedLoss(LossModule):
 
     def __init__(self, loss_module: LossModule, *, separate_losses: bool = False) -> None:
         _check_wrapped(loss_module)
-        if not isinstance(separate_losses, bool):
-            raise TypeError(f"separate_losses must be a bool, got {separate_losses!r}.")
+        check_flag(separate_losses=separate_losses)
         super().__init__()
         self.loss_module = loss_module
         self.separate_losses = separate_losses

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._checks import as_number, as_tensor, check_number, uncompiled
+from torchrl_safe._checks import as_tensor, check_one_each
+from torchrl_safe.objectives._checks import as_number, check_number, uncompiled
 
 #: Which updaters write which buffer of a loss.
 _UPDATERS = {
@@ -75,11 +76,7 @@ class CostUpdater(abc.ABC):
         if isinstance(cost_limit, Mapping):
             numbers = _in_order(cost_limit, self.cost_names if self._has_names else None)
         limit = as_tensor("cost_limit", numbers, buffer.dtype)
-        if limit.shape not in ((), buffer.shape):
-            raise ValueError(
-                f"cost_limit must be one number or one for each of the {len(buffer)} costs, "
-                f"got shape {tuple(limit.shape)}."
-            )
+        check_one_each("cost_limit", limit, len(buffer))
         if not limit.isfinite().all():
             raise ValueError(f"cost_limit must be finite, got {cost_limit}.")
         return limit.expand_as(buffer).clone()

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
+from torchrl_safe._checks import check_flag
 from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
@@ -82,8 +83,7 @@ class MultiplierUpdater(CostUpdater):
         normalize: bool = False,
         cost_names: Sequence[str] | None = None,
     ) -> None:
-        if not isinstance(normalize, bool):
-            raise TypeError(f"normalize must be a bool, got {normalize!r}.")
+        check_flag(normalize=normalize)
         self.normalize = normalize
         super().__init__(
             loss_module, cost_limit=cost_limit, pessimism=pessimism, cost_names=cost_names

@@ -8,9 +8,8 @@ from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import PPOLoss
 
+from torchrl_safe.objectives._checks import get_or_raise
 from torchrl_safe.objectives._reduction import reduced
-from torchrl_safe.objectives.critics.cost_values import get_or_raise
-from torchrl_safe.objectives.functional import penalized_advantage
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 
 
@@ -90,12 +89,6 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
     """
 
     cost_buffers = ("lagrange_multiplier", "cost_violation")
-
-    def policy_losses(
-        self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
-    ) -> TensorDictBase:
-        mixed = penalized_advantage(advantage, cost_advantage, self.lagrange_multiplier)
-        return self.unconstrained(tensordict, mixed)
 
     # Not among the outputs of forward: trainers add up everything there that is named a loss.
     def cost_surrogate_loss(self, tensordict: TensorDictBase) -> Tensor:

@@ -19,15 +19,15 @@ from torchrl_safe.objectives._checks import (
     check_episode_length,
     check_length_known,
     check_number,
+    get_or_raise,
     uncompiled,
 )
 from torchrl_safe.objectives._reduction import reduced
-from torchrl_safe.objectives.critics.cost_values import get_or_raise
 from torchrl_safe.objectives.functional import penalized_advantage, per_step
-from torchrl_safe.objectives.on_policy.policies import (
+from torchrl_safe.objectives.on_policy.policies import divergence
+from torchrl_safe.objectives.trust_region.actor_copy import (
     ActorCopy,
     actor_parameters,
-    divergence,
     importance_weight,
     in_precision,
 )

@@ -14,17 +14,14 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import GAE, ValueEstimatorBase
 
 from torchrl_safe._checks import check_count
+from torchrl_safe.objectives._checks import get_or_raise, initial_multiplier
+from torchrl_safe.objectives._reduction import report_each
 from torchrl_safe.objectives.critics.cost_td0 import CostTD0
-from torchrl_safe.objectives.critics.cost_values import (
-    CostValues,
-    get_or_raise,
-    initial_multiplier,
-    report_each,
-)
+from torchrl_safe.objectives.critics.cost_values import CostValues
 from torchrl_safe.objectives.functional import penalized_advantage
 
 
-class CostCriticsMixin(CostValues):
+class ConstrainedQLoss(CostValues):
     """Adds an ensemble of critics of k costs, and their multipliers, to a loss with Q-values.
 
     To be mixed into TorchRL's :class:`~torchrl.objectives.SACLoss` or
