@@ -318,9 +318,9 @@ def keep_policy(config: Config, algorithm: AlgorithmName, training: Training) ->
 
 
 def train_and_evaluate(
-    config: Config, algorithm: AlgorithmName, *, progress: bool = True, line: int = 0
-) -> tuple[TensorDictModuleBase, dict[str, Any]]:
-    """Trains with one algorithm and plays with what it has learnt; returns policy and results."""
+    config: Config, algorithm: AlgorithmName, line: int = 0, *, progress: bool = True
+) -> dict[str, Any]:
+    """Trains with one algorithm and plays with what it has learnt; returns what JSON can keep."""
     actor, log = train(config, algorithm, progress=progress, line=line)
     seconds = log.seconds
     evaluation, episodes = play(config, algorithm, actor)
@@ -333,7 +333,7 @@ def train_and_evaluate(
     }
     if ALGORITHMS[algorithm].shield is not None:
         result["without_shield"] = play(config, algorithm, actor, shielded=False)[0]
-    return actor, result
+    return result
 
 
 def play(
@@ -348,8 +348,8 @@ def play(
 
 
 def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
-    """One run of a grid: only what can be kept as JSON."""
-    return train_and_evaluate(config, algorithm, progress=False)[1]
+    """One run of a grid, which shows its own progress."""
+    return train_and_evaluate(config, algorithm, progress=False)
 
 
 def start(config: Config) -> dict[str, Any]:
@@ -375,11 +375,6 @@ def start(config: Config) -> dict[str, Any]:
     return results
 
 
-def result_of(config: Config, algorithm: AlgorithmName, line: int = 0) -> dict[str, Any]:
-    """Trains and evaluates one algorithm; returns its results, which fit into a pipe."""
-    return train_and_evaluate(config, algorithm, line=line)[1]
-
-
 def film(config: Config, path: Path, *, seed: int, **options: Any) -> None:
     """Films the policies of a run side by side; ``options`` are those of :func:`save_film`."""
     actors: dict[str, tuple[EnvBase, Policy]] = {
@@ -403,10 +398,10 @@ def finish(
     workers = min(config.side_by_side, len(algorithms))
     if workers < 2:
         for algorithm in algorithms:
-            yield algorithm, result_of(config, algorithm)
+            yield algorithm, train_and_evaluate(config, algorithm)
         return
     jobs = [(config, algorithm, line) for line, algorithm in enumerate(algorithms)]
-    for index, result in side_by_side(result_of, jobs, workers=workers):
+    for index, result in side_by_side(train_and_evaluate, jobs, workers=workers):
         yield algorithms[index], result
 
 

@@ -222,5 +222,5 @@ def test_pushing_is_learnt(tmp_path):
     """In two minutes, from nothing: most cubes are pushed to their goals."""
     chosen = {**KINDS[TASKS["push"]], **SMALL, "envs": 64, "demonstrations": 49_152}
     config = Config(**{**chosen, "frames": 16_384}, out=tmp_path)
-    _, results = train_and_evaluate(config, "ppo", progress=False)
+    results = train_and_evaluate(config, "ppo", progress=False)
     assert results["evaluation"]["success"][0] >= 0.8

@@ -27,6 +27,7 @@ except ImportError as error:
 
 __all__ = [
     "Estimate",
+    "WorstSeed",
     "conditional_value_at_risk",
     "constraint_regret",
     "cost_rate",

@@ -83,10 +83,8 @@ class DampedLeastSquares:
             ],
             axis=1,
         )
-        transposed = jacobian.transpose(0, 2, 1)
-        damped = jacobian @ transposed + self.damping**2 * np.eye(6)
-        change = transposed @ np.linalg.solve(damped, error[:, :, None])
-        return np.clip(angles + change[:, :, 0], state.joint_lower, state.joint_upper)
+        after = angles + _change(jacobian, error, self.damping**2)
+        return np.clip(after, state.joint_lower, state.joint_upper)
 
 
 class Approach(NamedTuple):
@@ -142,14 +140,18 @@ def approach(
         # The Jacobian holds only nearby, so steps are short.
         error = np.concatenate([_shortened(part[far]) for part in parts], axis=1)
         jacobian = simulator.jacobian(angles[searching])[:, : error.shape[1]]
-        transposed = jacobian.transpose(0, 2, 1)
-        damped = jacobian @ transposed + _DAMPING * np.eye(error.shape[1])
-        change = transposed @ np.linalg.solve(damped, error[:, :, None])
-        after = angles[searching] + change[:, :, 0]
+        after = angles[searching] + _change(jacobian, error, _DAMPING)
         if respect_limits:
             after = np.clip(after, simulator.joint_lower, simulator.joint_upper)
         angles[searching] = after
     return best
+
+
+def _change(jacobian: Array, error: Array, damping: float) -> Array:
+    """Changes of the joint angles, rad, ``(k, n)``, that nearly undo errors of the tool."""
+    transposed = jacobian.transpose(0, 2, 1)
+    damped = jacobian @ transposed + damping * np.eye(jacobian.shape[1])
+    return (transposed @ np.linalg.solve(damped, error[:, :, None]))[:, :, 0]
 
 
 def _length(vectors: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import NoReturn, Protocol, runtime_checkable
 
 import numpy as np
@@ -87,14 +87,7 @@ class Sensing:
         )
 
     def __or__(self, other: Sensing) -> Sensing:
-        return Sensing(
-            clearance=max(self.clearance, other.clearance),
-            table=self.table or other.table,
-            itself=self.itself or other.itself,
-            joints=self.joints or other.joints,
-            tool=self.tool or other.tool,
-            links=self.links or other.links,
-        )
+        return Sensing(*map(max, astuple(self), astuple(other)))
 
 
 @runtime_checkable

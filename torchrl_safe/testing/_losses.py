@@ -61,6 +61,15 @@ def build(
     return finish(lambda: make_loss(*networks, num_costs=num_costs), seed)
 
 
+def constrained(
+    make_loss: MakeLoss, make_networks: MakeNetworks, num_costs: int, constrain: Constrain
+) -> LossModule:
+    """A loss on new networks, under each constraint with strength 1."""
+    loss = build(make_loss, make_networks, num_costs)
+    constrain(loss, torch.ones(num_costs))
+    return loss
+
+
 def build_parent(make_parent: MakeLoss, make_networks: MakeNetworks, num_costs: int) -> LossModule:
     """A loss without costs on the same networks."""
     actor, critic, _ = make_networks(num_costs, seed=0, keys={})

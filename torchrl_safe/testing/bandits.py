@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import OneHotCategorical, ProbabilisticActor, ValueOperator
 from torchrl.objectives import LossModule
 
-from torchrl_safe.testing._losses import require
+from torchrl_safe.testing._losses import require, total
 
 with warnings.catch_warnings():  # TorchRL 0.14 deprecates a base class that it still derives from.
     warnings.filterwarnings("ignore", "Creating .* WeightUpdaterBase", DeprecationWarning)
@@ -29,6 +29,8 @@ class _OneStep(EnvBase):
     """Episodes of one step, many side by side; the observation is always 1."""
 
     def __init__(self, num_costs: int, num_envs: int) -> None:
+        if num_costs not in (1, 2):
+            raise ValueError(f"num_costs must be 1 or 2, got {num_costs!r}.")
         super().__init__(batch_size=[num_envs])
         self.num_costs = num_costs
         self.observation_spec = Composite(observation=Unbounded((num_envs, 1)), shape=[num_envs])
@@ -96,8 +98,6 @@ class ConstrainedBandit(_OneStep):
     optimal_probability = 0.3
 
     def __init__(self, num_costs: int = 2, num_envs: int = 512) -> None:
-        if num_costs not in (1, 2):
-            raise ValueError(f"num_costs must be 1 or 2, got {num_costs!r}.")
         super().__init__(num_costs, num_envs)
         self.action_spec = OneHot(2, shape=(num_envs, 2))
 
@@ -159,8 +159,6 @@ class ContinuousConstrainedBandit(_OneStep):
     optimal_action = 0.3
 
     def __init__(self, num_costs: int = 2, num_envs: int = 64) -> None:
-        if num_costs not in (1, 2):
-            raise ValueError(f"num_costs must be 1 or 2, got {num_costs!r}.")
         super().__init__(num_costs, num_envs)
         self.action_spec = Bounded(-1, 1, (num_envs, 1))
 
@@ -207,9 +205,7 @@ def run_epochs(
     """
     for _ in range(num_epochs):
         for minibatch in buffer:
-            outputs = losses(minibatch)
-            total = sum(value for key, value in outputs.items() if key.startswith("loss_"))
-            total.backward()
+            total(losses(minibatch)).backward()
             optimizer.step()
             optimizer.zero_grad()
 

@@ -14,8 +14,8 @@ from torchrl_safe.testing._losses import (
     MakeData,
     MakeLoss,
     MakeNetworks,
-    build,
     call,
+    constrained,
     loss_keys,
     named,
     require,
@@ -59,8 +59,7 @@ def check_gradients(
         >>> from torchrl_safe.objectives import PPOLagrangianLoss
         >>> check_gradients(PPOLagrangianLoss, {"loss_cost_critic": "cost_critic"})
     """
-    loss = build(make_loss, make_networks, num_costs)
-    constrain(loss, torch.ones(num_costs))
+    loss = constrained(make_loss, make_networks, num_costs, constrain)
     losses = call(loss, make_data(num_costs))
     keys, every = loss_keys(losses), set()
     for name in [*losses.keys()]:
@@ -132,8 +131,7 @@ def check_masked_steps(
 
     def run(data: TensorDictBase, seed: int = 7) -> TensorDictBase:
         # A new loss for each call: some, as KLPENPPOLoss, change a coefficient in a call.
-        loss = build(make_loss, make_networks, num_costs)
-        constrain(loss, torch.ones(num_costs))
+        loss = constrained(make_loss, make_networks, num_costs, constrain)
         losses = call(loss, data, seed=seed)
         return losses.select(*loss_keys(losses))
 

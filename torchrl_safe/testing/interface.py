@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from torchrl_safe.testing._losses import (
     MakeNetworks,
     build,
     call,
+    constrained,
     loss_keys,
     named,
     require,
@@ -144,12 +146,7 @@ def check_dispatch(
         >>> from torchrl_safe.objectives import PPOLagrangianLoss
         >>> check_dispatch(PPOLagrangianLoss)
     """
-
-    def make() -> LossModule:
-        loss = build(make_loss, make_networks, num_costs)
-        constrain(loss, torch.ones(num_costs))
-        return loss
-
+    make = partial(constrained, make_loss, make_networks, num_costs, constrain)
     loss, data = make(), make_data(num_costs)
     keys = [unravel_key(key) for key in loss.in_keys]
     duplicates = {key for key in keys if keys.count(key) > 1}
@@ -200,8 +197,7 @@ def check_input_unchanged(
         >>> from torchrl_safe.objectives import PPOLagrangianLoss
         >>> check_input_unchanged(PPOLagrangianLoss)
     """
-    loss = build(make_loss, make_networks, num_costs)
-    constrain(loss, torch.ones(num_costs))
+    loss = constrained(make_loss, make_networks, num_costs, constrain)
     data = make_data(num_costs)
     before = data.clone()
     loss(data)
@@ -294,8 +290,7 @@ def check_cast(
     data = make_data(num_costs)
     data = data.apply(lambda value: value.double() if value.is_floating_point() else value)
     for used in (False, True):
-        loss = build(make_loss, make_networks, num_costs)
-        constrain(loss, torch.ones(num_costs))
+        loss = constrained(make_loss, make_networks, num_costs, constrain)
         if used:
             call(loss, make_data(num_costs))
         losses = call(loss.to(torch.float64), data)

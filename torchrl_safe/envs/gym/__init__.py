@@ -34,17 +34,15 @@ __all__ = [
 
 
 def _register() -> None:
-    for parts in product(ARMS, TASKS, OBSTACLES, ACTIONS):
-        gymnasium.register(
-            f"torchrl_safe/{''.join(parts)}-v0",
-            entry_point=f"{__name__}:{ArmGymEnv.__name__}",
-            kwargs=combination(*parts),
-        )
-    for name, task in SUITE.items():
+    combined = {
+        "".join(parts): combination(*parts) for parts in product(ARMS, TASKS, OBSTACLES, ACTIONS)
+    }
+    suite = {name: task.arguments for name, task in SUITE.items()}
+    for name, arguments in {**combined, **suite}.items():
         gymnasium.register(
             f"torchrl_safe/{name}-v0",
             entry_point=f"{__name__}:{ArmGymEnv.__name__}",
-            kwargs=task.arguments,
+            kwargs=arguments,
         )
 
 

@@ -177,12 +177,15 @@ class CostCritic(CostValues):
         if not self._shared_keys:
             return tensordict.empty()
         trunk = self.actor_network.det_part.select_subsequence(out_keys=self._shared_keys)
-        with (
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
-            if self.functional
-            else contextlib.nullcontext()
-        ):
+        with self._with_params("actor_network"):
             return trunk(tensordict.select(*trunk.in_keys)).select(*self._shared_keys)
+
+    def _with_params(self, name: str) -> contextlib.AbstractContextManager[Any]:
+        """The network of that name has its parameters: in a functional loss they are apart."""
+        if not self.functional:
+            return contextlib.nullcontext()
+        params = getattr(self, f"{name}_params")
+        return params.to_module(getattr(self, name), preserve_module_state=False)
 
     def _with_features(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The batch, with the inputs of critics that are heads of the actor's network."""
@@ -250,13 +253,7 @@ class CostCritic(CostValues):
         old_value = None
         if self.clip_value:
             old_value = get_or_raise(tensordict, self.tensor_keys.cost_value)
-        with (
-            self.cost_critic_network_params.to_module(
-                self.cost_critic_network, preserve_module_state=False
-            )
-            if self.functional
-            else contextlib.nullcontext()
-        ):
+        with self._with_params("cost_critic_network"):
             # Give it only what it reads, so that a value in the data is not taken for what it
             # writes.
             data = tensordict.select(*self._cost_critic_in_keys, strict=False)

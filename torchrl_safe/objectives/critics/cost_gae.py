@@ -34,8 +34,8 @@ class CostGAE(GAE):
     Keyword Args:
         gamma (float): discount of the costs, from 0 to 1.
         lmbda (float): trace decay of the costs, from 0 to 1.
-        value_network (TensorDictModule, optional): cost critic with k outputs. ``None`` expects
-            ``"cost_value"`` and ``("next", "cost_value")`` in the data.
+        value_network (TensorDictModule, optional): cost critic with k outputs. Defaults to
+            ``None``, which expects ``"cost_value"`` and ``("next", "cost_value")`` in the data.
         vectorized (bool, optional): use the vectorized recursion, unless ``gamma`` or ``lmbda``
             is 0, for which TorchRL's fails. Defaults to ``True``.
         **kwargs: the other arguments of :class:`~torchrl.objectives.value.GAE`, ``average_gae``
@@ -88,7 +88,7 @@ class CostGAE(GAE):
         *,
         gamma: float,
         lmbda: float,
-        value_network: TensorDictModuleBase | None,
+        value_network: TensorDictModuleBase | None = None,
         vectorized: bool | None = True,
         **kwargs: Any,
     ) -> None:

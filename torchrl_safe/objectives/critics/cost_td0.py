@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.value import TD0Estimator
@@ -66,7 +67,9 @@ class CostTD0(TD0Estimator):
 
     default_keys = _AcceptedKeys
 
-    def __init__(self, *, gamma: float, value_network: Any = None, **kwargs: Any) -> None:
+    def __init__(
+        self, *, gamma: float, value_network: TensorDictModuleBase | None = None, **kwargs: Any
+    ) -> None:
         reason = "costs keep their unit, in which their limits are"
         refuse_options("CostTD0", kwargs, "average_rewards", "group_key", reason=reason)
         super().__init__(gamma=check_share("gamma", gamma), value_network=value_network, **kwargs)
