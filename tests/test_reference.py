@@ -65,6 +65,25 @@ def test_every_member_that_a_page_names_has_a_docstring_of_its_own():
     assert len(named) > 40
 
 
+def test_every_name_that_a_docstring_points_to_has_an_entry():
+    """Sphinx shows a reference that leads nowhere as plain text, without a word."""
+    members = [(m, n, member) for m, n, several in entries() for member in [None, *several]]
+    targets = {f"{m}.{n}" if member is None else f"{m}.{n}.{member}" for m, n, member in members}
+    names = {target.rsplit(".", 1)[1] for target in targets}
+    found = 0
+    for module, name, member in members:
+        owner = getattr(import_module(module), name)
+        described = owner if member is None else getattr(owner, member)
+        docstring = inspect.getdoc(described) or ""
+        for target in re.findall(r":(?:func|class|meth|data):`~?\.?([\w.]+)`", docstring):
+            if target.startswith("torchrl_safe"):
+                found += 1
+                assert target in targets, f"{name}: {target}"
+            elif "." not in target:
+                assert target in names or target in dir(owner), f"{name}: {target}"
+    assert found > 50
+
+
 def test_every_page_is_in_the_index():
     index = DOCS.joinpath("index.md").read_text(encoding="utf-8")
     listed = {line for line in index.splitlines() if re.fullmatch(r"[\w/]+", line)}

@@ -92,8 +92,7 @@ class Simulator(Protocol):
         Args:
             row: number of the world.
             placement: where the obstacles are. Those not present are out of the world. A
-                ``path`` moves them in every substep, with time 0 now: see
-                :func:`~torchrl_safe.envs.physics.paths.look_ahead`.
+                ``path`` moves them in every substep, with time 0 now.
             goal: target position, ``(3,)``.
             objects: centres of the objects, upright and at rest, ``(p, 3)``.
         """
@@ -124,7 +123,7 @@ class Simulator(Protocol):
 
         The arrays are new: later steps do not change them. ``step`` counts the control steps
         since the row's reset, and :meth:`restore` brings it back; ``time`` is
-        that times ``frame_skip`` times :data:`~torchrl_safe.envs.physics.scene.SUBSTEP`.
+        that times ``frame_skip`` times 1/240 s.
         """
 
     def tool_at(self, joints: Array) -> tuple[Array, Array]:
@@ -233,8 +232,7 @@ class Physics(Protocol):
             shapes: the m obstacles.
             objects: the p objects that the task moves.
             sensing: what is measured in every substep besides contacts.
-            frame_skip: substeps of a control step, each of
-                :data:`~torchrl_safe.envs.physics.scene.SUBSTEP` seconds.
+            frame_skip: substeps of a control step, each of 1/240 s.
             reach: distance up to which :meth:`Simulator.nearest` measures, m.
             gui: show the first world in a window.
 

@@ -61,7 +61,7 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
     Presented in "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
     Guarantee", Xu, Liang, Lan 2021 (https://arxiv.org/abs/2011.05869). There is no multiplier: as
     long as every mean episode cost is within its limit and a tolerance, the loss is the wrapped
-    one, bit for bit; else its advantage is that of :func:`rectified_advantage`. A
+    one, bit for bit; else its advantage is that of the cost that exceeds its limit most, negated. A
     :class:`~torchrl_safe.objectives.ViolationUpdater` brings the violations, once for each
     collected batch. The cost then swings about ``cost_limit + tolerance``. (The paper returns the
     policy of a randomly chosen step that maximized the reward.)

@@ -168,8 +168,9 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
                 with its ``cost_advantage``.
 
         Returns:
-            A tensordict with ``loss_projection`` (see :func:`projection_objective`), reduced like
-            the other losses, and ``kl``, the mean divergence from the improved policy.
+            A tensordict with ``loss_projection``, the divergence from the improved policy plus
+            the penalty of the costs, reduced like the other losses, and ``kl``, the mean of that
+            divergence.
 
         Raises:
             KeyError: if the data have no ``cost_advantage``.

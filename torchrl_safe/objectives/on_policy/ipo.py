@@ -66,7 +66,7 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
 
     A barrier keeps the policy away from the limit: with one binding cost the policy settles where
     :math:`t (d - J_c)` is the inverse of the optimal multiplier. The paper requires a policy that
-    starts within the limits. From outside, the tangent of :func:`log_barrier` leads back, like a
+    starts within the limits. From outside, a tangent of the barrier leads back, like a
     multiplier of t. OmniSafe's implementation gives the collecting policy's
     :math:`1 / (t (d_i - J_{c_i}))` the place of a multiplier, and holds it fixed while the policy
     moves.

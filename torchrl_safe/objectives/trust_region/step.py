@@ -100,13 +100,11 @@ class TrustRegionStep:
             Defaults to ``0.01``.
         damping (float, optional): multiple of the identity added to the Fisher matrix.
             Defaults to ``0.1``.
-        cg_iterations (int, optional): iterations of
-            :func:`~torchrl_safe.objectives.trust_region.solver.conjugate_gradient`.
-            Defaults to ``10``.
-        shrink (float, optional): see
-            :func:`~torchrl_safe.objectives.trust_region.solver.backtracking_line_search`.
-            Defaults to ``0.8``.
-        max_backtracks (int, optional): see there. Defaults to ``10``.
+        cg_iterations (int, optional): iterations of conjugate gradients, which solve for the
+            natural gradients. Defaults to ``10``.
+        shrink (float, optional): the line search tries the fractions 1, ``shrink``,
+            ``shrink**2`` ... of the step. Defaults to ``0.8``.
+        max_backtracks (int, optional): how often it shortens the step. Defaults to ``10``.
         dtype (torch.dtype, optional): precision in which the step is found: a copy of the actor
             is differentiated, solved for and tried in it, whatever that of the actor is. Where
             the gradients of reward and cost are almost parallel, single precision changes the
