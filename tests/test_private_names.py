@@ -1,4 +1,4 @@
-"""The private names of TorchRL that the objectives use. To use a new one, add it here.
+"""The private names of TorchRL that the package uses. To use a new one, add it here.
 
 A private name may move with any release of TorchRL. Those below are each explained where they
 are used; beside them stand two that TorchRL documents for subclasses.
@@ -11,7 +11,8 @@ import pytest
 import torchrl
 from torchrl.objectives import LossModule
 
-OBJECTIVES = Path(__file__).parents[1] / "torchrl_safe" / "objectives"
+PACKAGE = Path(__file__).parents[1] / "torchrl_safe"
+OBJECTIVES = PACKAGE / "objectives"
 TORCHRL = Path(torchrl.__file__).parent
 # Where the classes that ours are made of are written.
 SOURCES = [
@@ -36,6 +37,22 @@ OFF_POLICY = {"_alpha", "_compute_target_v2", "_next_value", "_reduce_loss"}
 OFF_POLICY_FILES = {
     *("critics/cost_td0.py", "off_policy/constrained.py"),
     *("off_policy/sac_lagrangian.py", "off_policy/td3_lagrangian.py"),
+}
+# Beside the losses: the sources of TorchRL that a file is made of, and what it uses of them. What
+# TorchRL's guide and Hydra tell a subclass to write is left out.
+HOOKS = {"_reset", "_step", "_set_seed", "_make_specs", "_target_"}
+ELSEWHERE = {
+    "collectors.py": (["collectors/_single.py"], {"_carrier", "_traj_pool"}),
+    "envs/arm_env.py": (["envs/common.py"], {"_has_frame_skip"}),
+    "envs/gym/safe.py": (
+        ["envs/common.py", "envs/gym_like.py", "envs/libs/gym.py"],
+        {"_async_env", "_build_env", "_convert_actions_to_numpy", "_env", "_is_batched"}
+        | {"_output_transform", "_replace_reset"},
+    ),
+    "trainers/configs.py": (
+        ["trainers/algorithms/configs/common.py", "trainers/algorithms/configs/trainers.py"],
+        {"_make_onpolicy_trainer", "_normalize_hydra_key"},
+    ),
 }
 
 
@@ -69,13 +86,18 @@ def used_in(tree):
             yield node.value
 
 
-@pytest.fixture(scope="module")
-def theirs():
-    trees = [ast.parse((TORCHRL / path).read_text()) for path in SOURCES]
+def private_names(sources):
+    """The private names that some files of TorchRL define."""
+    trees = [ast.parse((TORCHRL / path).read_text()) for path in sources]
     # What comes from nn.Module is not TorchRL's to move.
     inherited = set(dir(LossModule.__mro__[-2])) | {"_buffers", "_modules", "_parameters"}
     names = {name for tree in trees for name in defined_in(tree) if is_private(name)}
     return names - inherited
+
+
+@pytest.fixture(scope="module")
+def theirs():
+    return private_names(SOURCES)
 
 
 def used(theirs, *, off_policy):
@@ -108,3 +130,10 @@ def test_off_policy_losses_use_no_other_private_names(theirs):
     assert found.keys() <= allowed, {name: found[name] for name in found.keys() - allowed}
     assert allowed <= found.keys(), f"no longer used: {allowed - found.keys()}"
     assert len(ON_POLICY | ESTIMATORS | OFF_POLICY) <= 14
+
+
+@pytest.mark.parametrize("path", ELSEWHERE)
+def test_environments_collectors_and_trainers_use_no_other_private_names(path):
+    sources, allowed = ELSEWHERE[path]
+    found = private_names(sources) & set(used_in(ast.parse((PACKAGE / path).read_text())))
+    assert found - HOOKS == allowed

@@ -15,7 +15,7 @@ from tensordict.nn import (
     TensorDictParams,
 )
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
@@ -177,15 +177,16 @@ class CostCritic(CostValues):
         if not self._shared_keys:
             return tensordict.empty()
         trunk = self.actor_network.det_part.select_subsequence(out_keys=self._shared_keys)
-        with self._with_params("actor_network"):
+        with self._with_params(self.actor_network, "actor_network_params"):
             return trunk(tensordict.select(*trunk.in_keys)).select(*self._shared_keys)
 
-    def _with_params(self, name: str) -> contextlib.AbstractContextManager[Any]:
-        """The network of that name has its parameters: in a functional loss they are apart."""
+    def _with_params(
+        self, network: nn.Module, params: str
+    ) -> contextlib.AbstractContextManager[Any]:
+        """Puts the parameters of that name in: a functional loss keeps its networks without."""
         if not self.functional:
             return contextlib.nullcontext()
-        params = getattr(self, f"{name}_params")
-        return params.to_module(getattr(self, name), preserve_module_state=False)
+        return getattr(self, params).to_module(network, preserve_module_state=False)
 
     def _with_features(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The batch, with the inputs of critics that are heads of the actor's network."""
@@ -253,7 +254,7 @@ class CostCritic(CostValues):
         old_value = None
         if self.clip_value:
             old_value = get_or_raise(tensordict, self.tensor_keys.cost_value)
-        with self._with_params("cost_critic_network"):
+        with self._with_params(self.cost_critic_network, "cost_critic_network_params"):
             # Give it only what it reads, so that a value in the data is not taken for what it
             # writes.
             data = tensordict.select(*self._cost_critic_in_keys, strict=False)
