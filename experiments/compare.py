@@ -19,7 +19,7 @@ import tyro
 
 from experiments import train
 from experiments.algorithms import ALGORITHMS, configured
-from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine
+from experiments.config import SHIELDED, Action, AlgorithmName, Config as TrainConfig, Engine
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
 from experiments.style import LIGHT, colour, cost_axis, figure_style, label, limit_line
@@ -29,9 +29,7 @@ from torchrl_safe.metrics import worst_seed
 #: would exceed it, and the policy would learn to stay away from the target.
 BUDGETS: dict[AlgorithmName, float] = {"ppo-saute": 2.0, "ppo-early-termination": 2.0}
 #: Not those with a shield, which touch nothing.
-COMPARED: tuple[AlgorithmName, ...] = tuple(
-    name for name in ALGORITHMS if not name.endswith("-shield")
-)
+COMPARED: tuple[AlgorithmName, ...] = tuple(name for name in ALGORITHMS if name not in SHIELDED)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -64,6 +64,8 @@ CostName = Literal[
 MultiplierRule = Literal["pid", "dual-ascent", "fixed"]
 #: The algorithms that learn from replay; they need bounded actions.
 OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
+#: Those that train with a shield.
+SHIELDED: tuple[AlgorithmName, ...] = ("ppo-shield", "ppo-lagrangian-shield")
 #: Options that a task of the suite sets.
 SET_BY_SUITE = (
     *("arm", "task", "obstacles", "action", "observation", "paper", "costs", "cost_limit"),
@@ -208,10 +210,9 @@ class Config:
         self._refuse("paper", self.paper, "arm", "task", "obstacles", "physics", "costs")
         self._refuse("suite_task", self.suite_task is not None, *SET_BY_SUITE)
         self._refuse("costs", bool(self.costs), "cost_limit")
-        shielded = {"ppo-shield", "ppo-lagrangian-shield"}
-        if self.paper and shielded.intersection(self.chosen):
+        if self.paper and set(SHIELDED) & set(self.chosen):
             raise ValueError("shield must be False with paper, whose environment has none.")
-        if "correction" in self.costs and not shielded.issuperset(self.chosen):
+        if "correction" in self.costs and not set(SHIELDED) >= set(self.chosen):
             raise ValueError(
                 f"costs must not contain correction with algorithms without a shield, got "
                 f"{self.chosen}."

@@ -16,6 +16,7 @@ from matplotlib.ticker import EngFormatter
 from PIL import Image
 from torchrl.envs import EnvBase
 
+from experiments.config import SHIELDED
 from experiments.style import colour, cost_axis, figure_style, label, label_ends, limit_line
 from torchrl_safe.metrics import mean
 
@@ -100,9 +101,7 @@ def plot_curves(results: dict[str, Any], path: Path) -> None:
     runs = results["algorithms"]
     history = next(iter(runs.values()))["history"]
     costs = [key for key in max(history, key=len) if key.startswith("cost/")]
-    sums = [
-        f"summed/{key.partition('/')[2]}" for key in costs if any("shield" in name for name in runs)
-    ]
+    sums = [f"summed/{key.partition('/')[2]}" for key in costs if set(SHIELDED) & set(runs)]
     keys = ["return", *costs, *sums]
     with figure_style():
         figure, grid = plt.subplots(

@@ -53,12 +53,13 @@ from torchrl_safe.testing import make_batch, make_critic, make_networks
 
 def test_the_cost_surrogate_takes_the_larger_product():
     bounds = torch.tensor(0.8).log(), torch.tensor(1.2).log()
-    log_weight = torch.tensor([[2.0], [0.5], [1.1]]).log()
+    log_ratio = torch.tensor([[2.0], [0.5], [1.1]]).log()
     cost_advantage = torch.tensor([[1.0, -1.0], [1.0, -1.0], [3.0, -3.0]])
-    surrogate = clipped_cost_surrogate(log_weight, cost_advantage, bounds)
+    surrogate = clipped_cost_surrogate(log_ratio, cost_advantage, bounds)
     expected = torch.tensor([[2.0, -1.2], [0.8, -0.5], [3.3, -3.3]]) - cost_advantage
     torch.testing.assert_close(surrogate, expected)
-    weighted = clipped_cost_surrogate(log_weight, cost_advantage, bounds, math.log(2.0))
+    correction = torch.tensor(2.0).log()
+    weighted = clipped_cost_surrogate(log_ratio, cost_advantage, bounds, correction)
     torch.testing.assert_close(weighted, 2 * expected)
 
 

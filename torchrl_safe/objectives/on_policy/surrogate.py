@@ -17,10 +17,10 @@ from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO, Policy
 
 
 def clipped_cost_surrogate(
-    log_weight: Tensor,
+    log_ratio: Tensor,
     cost_advantage: Tensor,
     bounds: tuple[Tensor, Tensor],
-    log_is_weight: Tensor | float = 0.0,
+    log_correction: Tensor | None = None,
 ) -> Tensor:
     r"""PPO's surrogate with the sign of a cost, the larger of two products, from where it starts.
 
@@ -32,18 +32,18 @@ def clipped_cost_surrogate(
     that into a bias.
 
     Args:
-        log_weight (Tensor): logarithm of the ratio r that is clipped, shape ``(*B, 1)``.
+        log_ratio (Tensor): logarithm of the ratio r that is clipped, shape ``(*B, 1)``.
         cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
         bounds (tuple of Tensor): logarithms of the smallest and the largest clipped ratio.
-        log_is_weight (Tensor or float, optional): logarithm of what both products are weighted
-            by, shape ``(*B, 1)``. Defaults to ``0.0``.
+        log_correction (Tensor, optional): logarithm of what both products are weighted by, shape
+            ``(*B, 1)``. Defaults to ``None``: they are not.
 
     Returns:
         The surrogate of each sample and cost, shape ``(*B, k)``.
     """
-    ratio, clipped = log_weight.exp(), log_weight.clamp(*bounds).exp()
-    products = torch.maximum(ratio * cost_advantage, clipped * cost_advantage)
-    return torch.as_tensor(log_is_weight).exp() * (products - cost_advantage)
+    ratio, clipped = log_ratio.exp(), log_ratio.clamp(*bounds).exp()
+    surrogate = torch.maximum(ratio * cost_advantage, clipped * cost_advantage) - cost_advantage
+    return surrogate if log_correction is None else log_correction.exp() * surrogate
 
 
 class CostSurrogate(ConstrainedPPO):
@@ -96,7 +96,7 @@ class CostSurrogate(ConstrainedPPO):
             joint.log_ratio,
             cost_advantage,
             ((-low).log1p(), high.log1p()),
-            0.0 if joint.log_correction is None else joint.log_correction,
+            joint.log_correction,
         )
         columns = surrogate.unbind(-1)
         return torch.stack([reduced(self, each, tensordict, reduction="mean") for each in columns])
