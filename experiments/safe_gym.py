@@ -4,8 +4,9 @@
 
     python -m experiments.safe_gym --env SafetySwimmerVelocity-v1 --cost-limit 25
 
-The whole recipe is in this file, to be copied and changed. Sizes do not matter: observations are
-standardized, advantages and multiplier have no unit, and critics predict in units of their targets.
+Networks, statistics and loop are in this file, to be copied and changed; the algorithms' losses are
+in ``experiments/algorithms.py``. Sizes do not matter: observations are standardized, advantages and
+multiplier have no unit, and critics predict in units of their targets.
 """
 
 from __future__ import annotations
