@@ -259,9 +259,12 @@ def test_bad_mount_is_named(name):
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
+        ({"urdf": 3}, TypeError, "urdf must be an instance of str, got 3"),
+        ({"ee_link": None}, TypeError, "ee_link must be an instance of str, got None"),
         ({"goals": ((0, 0, 0), (1, 1, 1))}, TypeError, "goals must be an instance of Region"),
         ({"gripper": "gripper.urdf"}, TypeError, "gripper must be an instance of Gripper"),
         ({"finger_home": float("nan")}, ValueError, "finger_home must be finite"),
+        ({"handling_orientation": (0, 0, 0, 0)}, ValueError, "handling_orientation must be a unit"),
     ],
 )
 def test_arm_rejects(changes, error, message):

@@ -318,7 +318,7 @@ def test_what_moves_must_be_fixed(make_env):
         (lambda t: (np.ones((len(t), 1, 3)), np.ones((len(t), 4))), r"orientations of the path"),
         (
             lambda t: (np.ones((len(t), 1, 3)), np.ones((len(t), 1, 4))),
-            r"orientations of the path must be unit quaternions .*, got",
+            r"each orientation of the path must be a unit quaternion .*, got",
         ),
     ],
     ids=["count", "nan", "shape", "not-unit"],

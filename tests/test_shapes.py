@@ -10,6 +10,7 @@ from torchrl_safe.envs import (
     Capsule,
     Cylinder,
     NoObstacles,
+    Part,
     Placement,
     Reach,
     Region,
@@ -153,6 +154,7 @@ def test_every_shape_is_drawn(make_env):
         (lambda: Capsule(length=0), "length must be positive and finite, got 0"),
         (lambda: Capsule(mass=np.inf), "mass must be finite and not negative, got inf"),
         (lambda: Cylinder(mass=np.nan), "mass must be finite and not negative, got nan"),
+        (lambda: Part(Box(), (0, 0, 0), (1, 1, 1, 1)), "orientation must be a unit quaternion"),
     ],
 )
 def test_bad_arguments(make, message):

@@ -97,6 +97,15 @@ def check_one_each(name: str, values: Tensor, num_costs: int) -> None:
         )
 
 
+def check_unit(name: str, quaternions: NDArray[Any]) -> None:
+    """Raises ValueError unless each quaternion, the last dimension, has the length 1."""
+    wrong = np.abs(np.linalg.norm(quaternions, axis=-1) - 1) > 1e-3
+    if wrong.any():
+        raise ValueError(
+            f"{name} must be a unit quaternion (x, y, z, w), got {quaternions[wrong].squeeze()}."
+        )
+
+
 def keep_numbers(part: Any, name: str, count: int) -> NDArray[np.float64]:
     """Makes a field of a frozen dataclass a tuple of numbers, from a list, an array or a tensor.
 

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe._checks import check_flag, check_positive, keep_numbers
+from torchrl_safe._checks import check_flag, check_positive, check_unit, keep_numbers
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
@@ -111,11 +111,7 @@ class CartesianDelta:
                 f"inverse_kinematics must be callable, got {self.inverse_kinematics!r}."
             )
         if self.orientation is not None:
-            length = np.linalg.norm(keep_numbers(self, "orientation", 4))
-            if not np.isclose(length, 1, atol=1e-3):
-                raise ValueError(
-                    f"orientation must be a unit quaternion (x, y, z, w), got {self.orientation}."
-                )
+            check_unit("orientation", keep_numbers(self, "orientation", 4))
         for name in ("yaw_step", "rotation_step", "finger_step"):
             if getattr(self, name) is not None:
                 check_positive(**{name: getattr(self, name)})

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_safe._checks import check_array, check_kind
+from torchrl_safe._checks import check_array, check_kind, check_unit
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.kinematics import Approach, approach
 from torchrl_safe.envs.physics.bullet import Bullet
@@ -69,8 +69,7 @@ def find_home(
     check_kind("physics", physics, Physics)
     point = check_array("position", position, (3,))
     turned = check_array("orientation", orientation, (4,))
-    if not np.isclose(np.linalg.norm(turned), 1, atol=1e-3):
-        raise ValueError(f"orientation must be a unit quaternion, got {orientation}.")
+    check_unit("orientation", turned)
     simulator = physics.build(arm, Scene(), num_envs=1)
     try:
         found, free = (

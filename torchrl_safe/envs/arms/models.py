@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from torchrl_safe._checks import check_array, check_kind, keep_numbers
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_safe._checks import check_array, check_kind, check_unit, keep_numbers
 from torchrl_safe.envs.regions import Region
 
 
@@ -63,8 +66,9 @@ class ArmModel:
             :class:`~torchrl_safe.envs.CartesianDelta`. ``None`` stands for the home pose's.
 
     Raises:
-        TypeError: if ``goals`` or ``gripper`` is not of its kind. A file, link or home pose that
-            does not fit raises ValueError where the world is built.
+        TypeError: if ``urdf``, ``ee_link``, ``goals`` or ``gripper`` is not of its kind.
+        ValueError: if ``handling_orientation`` is no unit quaternion. A file, link or home pose
+            that does not fit raises it where the world is built.
 
     Examples:
         >>> iiwa = ArmModel("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", (0, 0.4, 0, -2, 0, 0.74, 0))
@@ -81,12 +85,28 @@ class ArmModel:
     handling_orientation: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
+        check_kind("urdf", self.urdf, str)
+        check_kind("ee_link", self.ee_link, str)
         check_kind("goals", self.goals, Region)
         check_array("finger_home", self.finger_home, ())
         if self.gripper is not None:
             check_kind("gripper", self.gripper, Gripper)
         if self.handling_orientation is not None:
-            keep_numbers(self, "handling_orientation", 4)
+            check_unit("handling_orientation", keep_numbers(self, "handling_orientation", 4))
+
+
+def check_home(arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> None:
+    """Raises ValueError unless the home pose is within the limits of the joints, rad, ``(n,)``."""
+    if len(arm.home) != len(lower):
+        raise ValueError(
+            f"home must give {len(lower)} joint angles, one for each movable joint up to "
+            f"{arm.ee_link!r}, got {len(arm.home)}."
+        )
+    if not np.all((lower <= arm.home) & (arm.home <= upper)):
+        raise ValueError(
+            f"home must be within the joint limits {lower.tolist()} and {upper.tolist()}, got "
+            f"{arm.home}."
+        )
 
 
 # Turned by a quarter, a hand has its narrow side to what is beside the object. The direction of the

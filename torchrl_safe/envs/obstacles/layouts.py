@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from torchrl_safe._checks import (
     check_kind,
     check_not_negative,
     check_positive,
+    check_unit,
     keep_numbers,
 )
 from torchrl_safe.envs.obstacles.shapes import Cylinder, Shape, footprint
@@ -71,7 +72,7 @@ class Placement:
             ),
             "present": present,
         }
-        _check_unit("orientation", filled["orientation"])
+        check_unit("orientation", filled["orientation"])
         for name, value in filled.items():
             object.__setattr__(self, name, value)
 
@@ -87,19 +88,13 @@ class Placement:
             places, turns = self.path(times)
             places = check_array("positions of the path", places, (repeats, count, 3))
             turns = check_array("orientations of the path", turns, (repeats, count, 4))
-            _check_unit("orientations of the path", turns)
+            check_unit("each orientation of the path", turns)
             # The path may keep what it returns, and simulators write where obstacles are absent.
             return places.copy(), turns.copy()
         return (
             np.repeat(self.position[None], repeats, axis=0),
             np.repeat(self.orientation[None], repeats, axis=0),
         )
-
-
-def _check_unit(name: str, orientation: NDArray[Any]) -> None:
-    wrong = np.abs(np.linalg.norm(orientation, axis=-1) - 1) > 1e-3
-    if wrong.any():
-        raise ValueError(f"{name} must be unit quaternions (x, y, z, w), got {orientation[wrong]}.")
 
 
 @runtime_checkable

@@ -6,7 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchrl_safe._checks import check_kind, check_not_negative, check_positive, keep_numbers
+from torchrl_safe._checks import (
+    check_kind,
+    check_not_negative,
+    check_positive,
+    check_unit,
+    keep_numbers,
+)
 from torchrl_safe.envs.rotations import UPRIGHT
 
 
@@ -20,7 +26,8 @@ class Part:
         orientation: a quaternion (x, y, z, w) in that frame.
 
     Raises:
-        ValueError: if ``position`` or ``orientation`` has the wrong shape or is not finite.
+        ValueError: if ``position`` or ``orientation`` has the wrong shape or is not finite, or
+            ``orientation`` is no unit quaternion.
 
     Examples:
         >>> Part(Sphere(0.02), position=(0.0, 0.0, 0.1)).position
@@ -33,7 +40,7 @@ class Part:
 
     def __post_init__(self) -> None:
         keep_numbers(self, "position", 3)
-        keep_numbers(self, "orientation", 4)
+        check_unit("orientation", keep_numbers(self, "orientation", 4))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.arms.models import check_home
 from torchrl_safe.envs.arms.urdf import prepare_urdf
 from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Part, Shape, Sphere
 from torchrl_safe.envs.physics.bullet.engine import pybullet, pybullet_data
@@ -96,16 +97,7 @@ def load_arm(
             raise ValueError(f"urdf {arm.urdf!r} does not load in PyBullet.") from error
     _check_shapes(client, body, text, arm.urdf)
     loaded = _find_joints(client, body, chain, tool_link)
-    if len(arm.home) != len(loaded.joints):
-        raise ValueError(
-            f"home must give {len(loaded.joints)} joint angles, one for each movable joint up to "
-            f"{arm.ee_link!r}, got {len(arm.home)}."
-        )
-    if not np.all((loaded.joint_lower <= arm.home) & (arm.home <= loaded.joint_upper)):
-        raise ValueError(
-            f"home must be within the joint limits {loaded.joint_lower.tolist()} and "
-            f"{loaded.joint_upper.tolist()}, got {arm.home}."
-        )
+    check_home(arm, loaded.joint_lower, loaded.joint_upper)
     if scene.motor_limits:
         _couple(client, body, loaded.fingers)
     return loaded

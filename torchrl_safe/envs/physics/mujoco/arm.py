@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.arms.models import check_home
 from torchrl_safe.envs.arms.urdf import prepare_urdf
 from torchrl_safe.envs.physics.mujoco.contacts import set_arm_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
@@ -79,7 +80,7 @@ def read_arm(
     except ValueError as error:
         raise ValueError(f"urdf {arm.urdf!r} does not load in MuJoCo: {error}") from error
     parts = _find_parts(spec, root, chain, tool)
-    _check_home(arm, parts)
+    check_home(arm, parts.joint_lower, parts.joint_upper)
     _free_joints(spec, parts)
     if couple:
         _couple(spec, parts.fingers)
@@ -147,19 +148,6 @@ def _limits(joint: ElementTree.Element) -> tuple[float, float, float, float]:
         lower, upper = -np.inf, np.inf
     effort, speed = (float(values.get(name, 0)) or np.inf for name in ("effort", "velocity"))
     return lower, upper, effort, speed
-
-
-def _check_home(arm: ArmModel, parts: ArmParts) -> None:
-    if len(arm.home) != len(parts.joints):
-        raise ValueError(
-            f"home must give {len(parts.joints)} joint angles, one for each movable joint up to "
-            f"{arm.ee_link!r}, got {len(arm.home)}."
-        )
-    if not np.all((parts.joint_lower <= arm.home) & (arm.home <= parts.joint_upper)):
-        raise ValueError(
-            f"home must be within the joint limits {parts.joint_lower.tolist()} and "
-            f"{parts.joint_upper.tolist()}, got {arm.home}."
-        )
 
 
 def _free_joints(spec: Any, parts: ArmParts) -> None:
