@@ -25,6 +25,20 @@ class Ways(NamedTuple):
     #: rad/s, ``(s + 1, m, 3)``.
     angular_velocity: Array
 
+    @classmethod
+    def zeros(cls, *shape: int) -> Ways:
+        """Zeros in all parts, each ``(*shape, width)``."""
+        return cls(*(np.zeros((*shape, width)) for width in WIDTHS))
+
+
+#: Numbers in each part of :class:`Ways`.
+WIDTHS = (3, 4, 3, 3)
+
+
+def limbo(index: int) -> tuple[float, float, float]:
+    """Out of the world, at a place where nothing else is."""
+    return (10.0 * index, 0.0, -100.0)
+
 
 def look_ahead(placement: Placement, elapsed: int, substeps: int) -> Ways:
     """Returns the obstacles' ways through the next substeps.

@@ -15,6 +15,7 @@ from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.bodies import LoadedArm, add_shape, load_arm, load_furniture
 from torchrl_safe.envs.physics.bullet.engine import pybullet
+from torchrl_safe.envs.physics.paths import limbo
 from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.physics.screws import distance_jacobian
 from torchrl_safe.envs.physics.simulator import Nearest
@@ -72,7 +73,7 @@ class Ruler:
             table = [pybullet.createMultiBody(0, plane, physicsClientId=client)]
         # Placed from outside, with or without a mass.
         self._obstacles = [
-            add_shape(client, replace(shape, mass=0.0), (0, 0, -100), None) for shape in shapes
+            add_shape(client, replace(shape, mass=0.0), limbo(0), None) for shape in shapes
         ]
         self._driven = self._arm.joints + self._arm.fingers
         infos = [

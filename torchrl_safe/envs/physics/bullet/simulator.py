@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Mapping, Sequence
-from itertools import accumulate
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,14 +16,13 @@ from torchrl_safe.envs.physics.bullet.readings import Vector, velocity_at
 from torchrl_safe.envs.physics.bullet.record import TargetRecord
 from torchrl_safe.envs.physics.bullet.ruler import Ruler
 from torchrl_safe.envs.physics.bullet.world import TOOL_MOTION, World
+from torchrl_safe.envs.physics.rows import places, split
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Nearest, Saved
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Trace, is_touch
 
 if TYPE_CHECKING:
     from torchrl_safe.envs.physics.bullet.physics import Bullet
-
-Parts = Mapping[str, tuple[slice, tuple[int, ...]]]
 
 
 class BulletSimulator:
@@ -87,8 +84,8 @@ class BulletSimulator:
         self.home_position: Array = np.array(first.home_position)
         self.home_orientation: Array = np.array(first.home_orientation)
         self._sizes = np.array([shape.half_extents for shape in shapes]).reshape(-1, 3)
-        self._parts = parts(first.read_shapes())
-        self._trace_parts = parts(first.trace_shapes())
+        self._places = places(first.read_shapes())
+        self._trace_places = places(first.trace_shapes())
         self._targets = TargetRecord(num_envs)
         self._rows: list[Sequence[float]] = [()] * num_envs
         self._measured: list[Sequence[Sequence[float]]] = [()] * num_envs
@@ -126,7 +123,7 @@ class BulletSimulator:
 
     def state(self) -> ArmState:
         """Returns the state of all worlds."""
-        row: dict[str, Any] = {**split(np.array(self._rows), self._parts)}
+        row: dict[str, Any] = split(np.array(self._rows), self._places)
         tool = [row["ee_position"], *(row.pop(name) for name in TOOL_MOTION)]
         velocity = velocity_at(*([*part.T] for part in tool))
         del row["finger_velocity"]
@@ -142,7 +139,7 @@ class BulletSimulator:
             step=self._targets.steps.copy(),
             time=self._targets.steps * self._frame_skip * SUBSTEP,
             trace=Trace(
-                split(np.array(self._measured), self._trace_parts) if self._trace_parts else {}
+                split(np.array(self._measured), self._trace_places) if self._trace_places else {}
             ),
             previous=None,
         )
@@ -169,7 +166,7 @@ class BulletSimulator:
         """Measures how far the arm would be from obstacles and table."""
         if self._ruler is None:
             raise ValueError("reach must be given to build to measure distances, got None.")
-        now = split(np.array([self._rows[row] for row in rows.tolist()]), self._parts)
+        now = split(np.array([self._rows[row] for row in rows.tolist()]), self._places)
         angles = np.concatenate([joints, fingers], axis=1)
         return self._ruler(angles, now["obstacle_position"], now["obstacle_orientation"])
 
@@ -218,21 +215,3 @@ class BulletSimulator:
             self._picture_world.close()
         if self._ruler is not None:
             self._ruler.close()
-
-
-def parts(shapes: Mapping[str, tuple[int, ...]]) -> Parts:
-    """Where the named parts of the given shapes are in a row that has them one after the other."""
-    widths = [math.prod(shape) for shape in shapes.values()]
-    ends = list(accumulate(widths))
-    return {
-        name: (slice(end - width, end), shape)
-        for (name, shape), width, end in zip(shapes.items(), widths, ends, strict=True)
-    }
-
-
-def split(table: Array, parts: Parts) -> dict[str, Array]:
-    """Cuts the last axis of a table into its parts."""
-    return {
-        name: table[..., where].reshape(*table.shape[:-1], *shape)
-        for name, (where, shape) in parts.items()
-    }

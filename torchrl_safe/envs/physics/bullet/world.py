@@ -26,7 +26,7 @@ from torchrl_safe.envs.physics.bullet.bodies import (
 from torchrl_safe.envs.physics.bullet.engine import pybullet
 from torchrl_safe.envs.physics.bullet.readings import MovingBody, Readings, Vector, link_state
 from torchrl_safe.envs.physics.palette import OBJECT, OBSTACLE, TOUCHED, colour
-from torchrl_safe.envs.physics.paths import look_ahead
+from torchrl_safe.envs.physics.paths import WIDTHS, Ways, limbo, look_ahead
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.rotations import UPRIGHT
 from torchrl_safe.envs.state import Array, Sensing
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 #: Centre of mass of the tool link, m, its velocity, m/s, and the link's angular velocity, rad/s.
 TOOL_MOTION = ("ee_centre", "ee_centre_velocity", "ee_angular_velocity")
-_LIMBO = (0.0, 0.0, -100.0)
 _AT_REST = (0.0, 0.0, 0.0)
 
 
@@ -126,17 +125,17 @@ class World:
         self._senses = sensing != Sensing()
         dark, blue = (OBSTACLE, OBJECT) if visuals else (None, None)
         self._obstacles = [
-            add_shape(client, shape, _limbo(index), dark) for index, shape in enumerate(shapes)
+            add_shape(client, shape, limbo(index), dark) for index, shape in enumerate(shapes)
         ]
         self._objects = [
-            add_shape(client, shape, _limbo(index + len(shapes)), blue)
+            add_shape(client, shape, limbo(index + len(shapes)), blue)
             for index, shape in enumerate(objects)
         ]
         self._shapes = tuple(shapes)
         self._is_fixed = [shape.mass == 0 for shape in shapes]
         urdf = options.target_urdf
-        self._brick = brick = None if urdf is None else load_body(client, urdf, _LIMBO)
-        self._markers = add_goal(client, _LIMBO) if visuals and brick is None else []
+        self._brick = brick = None if urdf is None else load_body(client, urdf, limbo(0))
+        self._markers = add_goal(client, limbo(0)) if visuals and brick is None else []
         bodies = zip(self._obstacles, self._is_fixed, strict=True)
         self._movable = [body for body, fixed in bodies if not fixed] + self._objects
         if self._brick is not None:
@@ -160,12 +159,12 @@ class World:
         if sensing.itself:
             self._allow_overlaps()
         self._home = pybullet.saveState(physicsClientId=client)
-        self._goal: Vector = _LIMBO
+        self._goal: Vector = limbo(0)
         self._present: list[int] = []
         self._bodies_move = True
         self._bodies: list[float] = []
         self._poses: list[tuple[Vector, Vector]] = [
-            (_limbo(index), UPRIGHT) for index in range(len(shapes))
+            (limbo(index), UPRIGHT) for index in range(len(shapes))
         ]
         self._velocities: list[tuple[Vector, Vector]] = [(_AT_REST, _AT_REST)] * len(shapes)
         link = self._link_state(fresh=True)
@@ -193,7 +192,7 @@ class World:
         # present: Bullet keeps contact points over a restore, in an order that depends on what
         # happened before.
         for index, body in enumerate(self._movable):
-            self._place(body, _limbo(len(self._obstacles) + index))
+            self._place(body, limbo(len(self._obstacles) + index))
         pybullet.performCollisionDetection(physicsClientId=client)
         pybullet.restoreState(self._home, physicsClientId=client)
         self._positions = None
@@ -202,7 +201,7 @@ class World:
         self._placement, self._substeps = placement, 0
         poses = zip(placement.position.tolist(), placement.orientation.tolist(), strict=True)
         for index, (body, pose) in enumerate(zip(self._obstacles, poses, strict=True)):
-            self._poses[index] = pose if index in self._present else (_limbo(index), UPRIGHT)
+            self._poses[index] = pose if index in self._present else (limbo(index), UPRIGHT)
             self._velocities[index] = (_AT_REST, _AT_REST)
             self._place(body, *self._poses[index])
         if placement.path is not None:
@@ -335,7 +334,7 @@ class World:
         return [
             number
             for bodies in (objects, obstacles)
-            for part in range(len(_BODY_PARTS))
+            for part in range(len(WIDTHS))
             for body in bodies
             for number in body[part]
         ]
@@ -354,7 +353,7 @@ class World:
             "goal": (3,),
         }
         for kind, bodies in (("object", self._objects), ("obstacle", self._obstacles)):
-            for part, width in _BODY_PARTS.items():
+            for part, width in zip(Ways._fields, WIDTHS, strict=True):
                 shapes[f"{kind}_{part}"] = (len(bodies), width)
         return shapes
 
@@ -505,11 +504,3 @@ class World:
     def _obstacle_velocity(self, index: int) -> tuple[Vector, Vector]:
         simulated = self._is_simulated(index)
         return self._velocity(self._obstacles[index]) if simulated else self._velocities[index]
-
-
-_BODY_PARTS = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity": 3}
-
-
-def _limbo(index: int) -> tuple[float, float, float]:
-    """Out of the world, at a place where nothing else is."""
-    return (10.0 * index, 0.0, -100.0)

@@ -12,7 +12,7 @@ import numpy as np
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.arms.models import check_home
 from torchrl_safe.envs.arms.urdf import prepare_urdf
-from torchrl_safe.envs.physics.mujoco.contacts import set_arm_contacts
+from torchrl_safe.envs.physics.mujoco.contacts import collides, set_arm_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.mujoco.meshes import read_meshes
 from torchrl_safe.envs.state import Array
@@ -96,8 +96,7 @@ def name_solids(spec: Any) -> dict[str, str]:
     solids: dict[str, str] = {}
     for body in spec.bodies[1:]:
         for geom in body.geoms:
-            # Shapes that are only drawn have neither.
-            if geom.contype or geom.conaffinity:
+            if collides(geom):
                 geom.name = f"arm/{len(solids)}"
                 solids[geom.name] = body.name
     return solids

@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from torchrl_safe.envs.physics.mujoco.contacts import set_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
-from torchrl_safe.envs.physics.mujoco.free import TO_MUJOCO
+from torchrl_safe.envs.physics.mujoco.quaternions import TO_MUJOCO
 from torchrl_safe.envs.physics.palette import (
     OBJECT,
     OBSTACLE,

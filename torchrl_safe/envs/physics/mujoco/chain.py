@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.mujoco.quaternions import TO_MUJOCO, rotation_matrix
 from torchrl_safe.envs.rotations import from_z_axis
 from torchrl_safe.envs.state import Array
 
@@ -46,7 +47,7 @@ class Chain:
             frame = frame @ _frame(model.body_pos[body], model.body_quat[body])
             joint = model.body_jntadr[body]
             if joint in wanted:
-                turned = _frame(np.zeros(3), _from_z_axis(model.jnt_axis[joint]))
+                turned = _frame(np.zeros(3), from_z_axis(model.jnt_axis[joint])[TO_MUJOCO])
                 before.append(frame @ turned)
                 slides.append(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
                 frame = turned.T
@@ -100,14 +101,8 @@ def quaternions(matrix: Array) -> Array:
     return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
 
-def _from_z_axis(axis: Array) -> Array:
-    """The quaternion (w, x, y, z) that brings the z axis to a unit vector."""
-    return from_z_axis(axis)[[3, 0, 1, 2]]
-
-
 def _frame(position: Array, quaternion: Array) -> Array:
-    """A homogeneous matrix, of a quaternion (w, x, y, z)."""
-    turn, frame = np.zeros(9), np.eye(4)
-    mujoco.mju_quat2Mat(turn, quaternion)
-    frame[:3, :3], frame[:3, 3] = turn.reshape(3, 3), position
+    """A homogeneous matrix, of one of MuJoCo's quaternions."""
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = rotation_matrix(quaternion), position
     return frame

@@ -48,6 +48,11 @@ def set_options(spec: Any, gravity: float, *, standing: bool) -> None:
         option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
 
 
+def collides(geom: Any) -> bool:
+    """Whether a shape is more than drawn."""
+    return bool(geom.contype or geom.conaffinity)
+
+
 def set_arm_contacts(spec: Any, frictions: Mapping[str, float], *, itself: bool) -> None:
     """Makes the shapes of an arm collide, with each other if wanted.
 
@@ -59,8 +64,7 @@ def set_arm_contacts(spec: Any, frictions: Mapping[str, float], *, itself: bool)
     for body in spec.bodies[1:]:
         own = frictions.get(body.name)
         for geom in body.geoms:
-            # Shapes that are only drawn have neither.
-            if geom.contype or geom.conaffinity:
+            if collides(geom):
                 _set(geom, _ARM, _FIXED | _FREE | (_ARM if itself else 0))
                 if own is not None:
                     geom.friction = (_FRICTION * own, _SPIN, _ROLL)

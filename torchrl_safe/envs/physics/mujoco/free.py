@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_safe.envs.physics.mujoco.quaternions import FROM_MUJOCO, TO_MUJOCO
 from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.state import Array
 from torchrl_safe.envs.vectors import turn
 
 Indices = NDArray[np.int_]
-
-#: MuJoCo's quaternions are w, x, y, z, ours x, y, z, w.
-TO_MUJOCO, _TO_OURS = [3, 0, 1, 2], [1, 2, 3, 0]
 
 
 class FreeBodies:
@@ -46,10 +44,10 @@ class FreeBodies:
     def read(self, qpos: Array, qvel: Array) -> Ways:
         """Returns their poses and velocities, each ``(..., b, width)``."""
         if not len(self._position):
-            return Ways(*(np.zeros((*qpos.shape[:-1], 0, width)) for width in (3, 4, 3, 3)))
+            return Ways.zeros(*qpos.shape[:-1], 0)
         # Other ways of indexing lay the numbers out anew, and the last bit of what is computed with
         # them depends on that.
         poses, moves = qpos.take(self._position, axis=-1), qvel.take(self._velocity, axis=-1)
-        orientation = poses[..., 3:].take(_TO_OURS, axis=-1)
+        orientation = poses[..., 3:].take(FROM_MUJOCO, axis=-1)
         # MuJoCo tells the angular velocity in the frame of the body.
         return Ways(poses[..., :3], orientation, moves[..., :3], turn(orientation, moves[..., 3:]))

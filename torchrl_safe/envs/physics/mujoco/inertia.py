@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.mujoco.quaternions import rotation_matrix
 from torchrl_safe.envs.state import Array
 
 _CORNERS = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
@@ -30,7 +31,7 @@ def set_box_inertias(spec: Any) -> None:
         compiled = model.body(body.name)
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == compiled.id]
         if geoms and body.mass:
-            axes = _matrix(body.iquat)
+            axes = rotation_matrix(body.iquat)
             size = np.ptp(np.concatenate([_points(model, geom, axes) for geom in geoms]), axis=0)
         elif body.joints:
             continue
@@ -43,7 +44,7 @@ def set_box_inertias(spec: Any) -> None:
 
 def _points(model: Any, geom: int, axes: Array) -> Array:
     """Points whose box along the given axes is that of a shape, ``(k, 3)``."""
-    turn, (x, y, z) = axes.T @ _matrix(model.geom_quat[geom]), model.geom_size[geom]
+    turn, (x, y, z) = axes.T @ rotation_matrix(model.geom_quat[geom]), model.geom_size[geom]
     kind = mujoco.mjtGeom(model.geom_type[geom])
     centre = axes.T @ model.geom_pos[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
@@ -61,10 +62,3 @@ def _points(model: Any, geom: int, axes: Array) -> Array:
     else:
         half = y * along + x * np.sqrt(np.maximum(0, 1 - along**2))
     return centre + np.stack([-half, half])
-
-
-def _matrix(quaternion: Array) -> Array:
-    """The rotation matrix of a quaternion (w, x, y, z)."""
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=float))
-    return matrix.reshape(3, 3)

@@ -26,8 +26,9 @@ from torchrl_safe.envs.physics.mujoco.contacts import (
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.mujoco.inertia import set_box_inertias
 from torchrl_safe.envs.physics.mujoco.motors import add_motors, add_rotors, set_gains
-from torchrl_safe.envs.physics.mujoco.readings import CONTACT_RANGE, Place, Sensors
+from torchrl_safe.envs.physics.mujoco.readings import CONTACT_RANGE, Sensors
 from torchrl_safe.envs.physics.mujoco.scenery import add_scenery, dress_arm
+from torchrl_safe.envs.physics.rows import Place
 from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.state import Array, Sensing
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from torchrl_safe.envs.physics.mujoco.arm import ArmParts
 from torchrl_safe.envs.physics.mujoco.bodies import TABLE, obstacle
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.paths import Ways
+from torchrl_safe.envs.physics.rows import places
 from torchrl_safe.envs.state import Array, Sensing
 from torchrl_safe.envs.vectors import cross
 
@@ -23,19 +23,6 @@ _SLOTS = 16
 _NEAREST = 1  # How a contact sensor sorts what it has found.
 # What is where in the readings of contacts; the force is in the frame of the contact.
 _FOUND, _NORMAL_FORCE, _DIST = 0, 1, 4
-
-
-class Place(NamedTuple):
-    """Where readings of one kind are in a row of sensor data."""
-
-    #: Their numbers in the row.
-    columns: slice
-    #: Their shape.
-    shape: tuple[int, ...]
-
-    def of(self, data: Array) -> Array:
-        """Cuts them out of rows ``(..., width)``; a view."""
-        return data[..., self.columns].reshape(*data.shape[:-1], *self.shape)
 
 
 class Sensors:
@@ -57,12 +44,15 @@ class Sensors:
         shapes: Sequence[Shape],
         sensing: Sensing,
     ) -> None:
-        self._spec, self._parts = spec, parts
-        self._width = 0
-        #: Where the readings of each kind are.
-        self.places: dict[str, Place] = {}
+        self._spec = spec
+        self._shapes: dict[str, tuple[int, ...]] = {}
         frame = mujoco.mjtObj.mjOBJ_XBODY
-        self._add_contacts("contacts", shapes, slots=_SLOTS, data=("FOUND", "FORCE", "DIST"))
+        for index, shape in enumerate(shapes):
+            # With the arm's base too if the obstacle is free.
+            arm = parts.root if shape.mass else parts.moving
+            geom = mujoco.mjtObj.mjOBJ_GEOM
+            self._add_contact(arm, geom, obstacle(index), _SLOTS, ("FOUND", "FORCE", "DIST"))
+        self._shapes["contacts"] = (len(shapes), _SLOTS, 5)
         if sensing.clearance:
             self._add_distances(solids, shapes, sensing.clearance)
         if sensing.table:
@@ -77,16 +67,13 @@ class Sensors:
             kind, body = mujoco.mjtSensor.mjSENS_FRAMELINVEL, mujoco.mjtObj.mjOBJ_BODY
             for link in parts.links:
                 spec.add_sensor(type=kind, objtype=body, objname=link)
-            self._note("links", (len(parts.links), 3))
+            self._shapes["links"] = (len(parts.links), 3)
+        #: Where the readings of each kind are.
+        self.places = places(self._shapes)
 
     def _add(self, name: str, kind: Any, objtype: Any, objname: str) -> None:
         self._spec.add_sensor(type=kind, objtype=objtype, objname=objname)
-        self._note(name, (3,))
-
-    def _note(self, name: str, shape: tuple[int, ...]) -> None:
-        width = math.prod(shape)
-        self.places[name] = Place(slice(self._width, self._width + width), shape)
-        self._width += width
+        self._shapes[name] = (3,)
 
     def _add_distances(
         self, solids: Mapping[str, str], shapes: Sequence[Shape], reach: float
@@ -106,25 +93,15 @@ class Sensors:
                     refname=obstacle(index),
                     cutoff=reach,
                 )
-        self._note("closest", (len(shapes), len(solids), 2, 3))
+        self._shapes["closest"] = (len(shapes), len(solids), 2, 3)
         for body in solids.values():
             for kind in (kinds.mjSENS_FRAMEPOS, kinds.mjSENS_FRAMELINVEL, kinds.mjSENS_FRAMEANGVEL):
                 self._spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body)
-        self._note("motions", (len(solids), 3, 3))
-
-    def _add_contacts(
-        self, name: str, shapes: Sequence[Shape], *, slots: int, data: Sequence[str]
-    ) -> None:
-        """Contacts of each obstacle with the arm, its base included if the obstacle is free."""
-        for index, shape in enumerate(shapes):
-            arm = self._parts.root if shape.mass else self._parts.moving
-            self._add_contact(arm, mujoco.mjtObj.mjOBJ_GEOM, obstacle(index), slots, data)
-        width = sum(_WIDTHS[part] for part in data)
-        self._note(name, (len(shapes), slots, width))
+        self._shapes["motions"] = (len(solids), 3, 3)
 
     def _add_touch(self, name: str, body: str, reftype: Any, refname: str) -> None:
         self._add_contact(body, reftype, refname, 1, ("FOUND", "DIST"))
-        self._note(name, (2,))
+        self._shapes[name] = (2,)
 
     def _add_contact(
         self, body: str, reftype: Any, refname: str, slots: int, data: Sequence[str]
@@ -138,10 +115,6 @@ class Sensors:
         )
         bits = (int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{part}")) for part in data)
         sensor.intprm[:3] = (sum(1 << bit for bit in bits), _NEAREST, slots)
-
-
-# Of what a contact sensor can tell, in its order.
-_WIDTHS = {"FOUND": 1, "FORCE": 3, "DIST": 1}
 
 
 def touches(data: Array) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchrl_safe.envs.physics.mujoco.contacts import collides
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.palette import (
     ARM,
@@ -22,9 +23,9 @@ _HIDDEN = 3  # A group of shapes that is not drawn.
 def dress_arm(spec: Any) -> None:
     """Hides the shapes that collide wherever a link has others to show."""
     for body in spec.bodies[1:]:
-        shown = [geom for geom in body.geoms if not (geom.contype or geom.conaffinity)]
+        shown = [geom for geom in body.geoms if not collides(geom)]
         for geom in body.geoms:
-            if geom.contype or geom.conaffinity:
+            if collides(geom):
                 if shown:
                     geom.group = _HIDDEN
                 else:

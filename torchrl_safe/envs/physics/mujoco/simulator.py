@@ -15,10 +15,11 @@ from torchrl_safe.envs.physics.mujoco.bodies import obstacle, thing
 from torchrl_safe.envs.physics.mujoco.chain import Chain, ToolPose
 from torchrl_safe.envs.physics.mujoco.clearance import Clearance
 from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
-from torchrl_safe.envs.physics.mujoco.free import TO_MUJOCO, FreeBodies
+from torchrl_safe.envs.physics.mujoco.free import FreeBodies
 from torchrl_safe.envs.physics.mujoco.model import build_scenery, build_world
 from torchrl_safe.envs.physics.mujoco.motors import FINGER_GROUP, fill_controls
 from torchrl_safe.envs.physics.mujoco.pictures import Painter
+from torchrl_safe.envs.physics.mujoco.quaternions import TO_MUJOCO
 from torchrl_safe.envs.physics.mujoco.readings import nearest, touch_distance, touches
 from torchrl_safe.envs.physics.mujoco.ruler import Ruler
 from torchrl_safe.envs.physics.mujoco.tracks import Tracks
@@ -76,6 +77,7 @@ class MuJoCoSimulator:
         self._chain = Chain(model, parts.joints, parts.tool)
         self._pose: tuple[Array, ToolPose] | None = None
         self._controls = np.zeros((num_envs, frame_skip, model.nu))
+        self._fingers_rest = False  # Whether their motors do.
         self._clearance = Clearance(model, [obstacle(index) for index in range(len(shapes))])
         self._ruler: Ruler | None = None
         if reach is not None:
@@ -211,9 +213,6 @@ class MuJoCoSimulator:
             resting = 0 if drive else 1 << FINGER_GROUP
             self._batch.expand("opt.disableactuator")[:] = resting
             self._fingers_rest = not drive
-
-    # Whether the motors of the fingers rest.
-    _fingers_rest = False
 
     def _check(self) -> None:
         # One number that is not finite makes the sum so.

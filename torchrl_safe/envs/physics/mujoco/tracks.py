@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_safe.envs.obstacles import Placement
-from torchrl_safe.envs.physics.paths import Ways, look_ahead
+from torchrl_safe.envs.physics.paths import Ways, limbo, look_ahead
 from torchrl_safe.envs.rotations import UPRIGHT
 
 # Substeps, about, for which ways are computed at once: as cheap as for a single control step.
@@ -25,30 +25,24 @@ class Tracks:
         self._frame_skip = frame_skip
         self._ahead = frame_skip * max(1, _AHEAD // frame_skip)
         self._placements: list[Placement | None] = [None] * num_envs
-        self._limbo = np.array([(10.0 * index, 0.0, -100.0) for index in range(count)]).reshape(
-            -1, 3
-        )
+        self._limbo = np.array([limbo(index) for index in range(count)]).reshape(-1, 3)
         #: Which obstacles a world has, ``(N, m)``.
         self.present = np.zeros((num_envs, count), dtype=bool)
         #: Whether an obstacle of any world is on its way.
         self.moving = False
         #: Where they are now, each ``(N, m, width)``.
-        self.now = self._room(num_envs, count)
+        self.now = Ways.zeros(num_envs, count)
         # The ways of each world from some substep on, which substep that is, and how far it has
         # gone since.
         self._ways: Ways | None = None
         self._begin, self._gone = np.zeros((2, num_envs), dtype=int)
-
-    @staticmethod
-    def _room(*shape: int) -> Ways:
-        return Ways(*(np.zeros((*shape, width)) for width in (3, 4, 3, 3)))
 
     def reset(self, row: int, placement: Placement) -> None:
         """Begins an episode in one world."""
         self._placements[row], self.present[row] = placement, placement.present
         if placement.path is not None and not self.moving:
             self.moving = True
-            self._ways = self._room(len(self.present), self._ahead + 1, self.present.shape[1])
+            self._ways = Ways.zeros(len(self.present), self._ahead + 1, self.present.shape[1])
             for other, begun in enumerate(self._placements):
                 if begun is not None:
                     self.seek(other, 0)
