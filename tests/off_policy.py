@@ -1,10 +1,13 @@
 """Off-policy losses with tiny networks, beside their parents."""
 
+from functools import partial
+
+import pytest
 import torch
 from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
 
 from torchrl_safe.objectives import SACLagrangianLoss, TD3LagrangianLoss
-from torchrl_safe.testing import make_q_actor, make_q_critic
+from torchrl_safe.testing import make_q_actor, make_q_critic, make_q_networks, make_transitions
 
 PARENTS = {SACLagrangianLoss: SACLoss, TD3LagrangianLoss: TD3Loss}
 OWN = {SACLagrangianLoss: {"target_entropy": -2.0}, TD3LagrangianLoss: {"bounds": (-1.0, 1.0)}}
@@ -72,3 +75,36 @@ def call(loss, batch, seed=7):
     """Outputs of a loss whose random numbers begin at a seed."""
     torch.manual_seed(seed)
     return loss(batch)
+
+
+each_loss = pytest.mark.parametrize(
+    "kind", [SACLagrangianLoss, TD3LagrangianLoss], ids=["sac", "td3"]
+)
+
+# Only these outputs have a gradient, and this is the network each of them trains.
+TRAINS = {"loss_actor": "actor", "loss_qvalue": "qvalue", "loss_cost_qvalue": "cost_qvalue"}
+
+
+def networks_with_gradient(loss):
+    def is_reached(p):
+        return p.grad is not None and bool(p.grad.any())
+
+    return {name for name in networks(loss) if any(map(is_reached, parameters(loss, name)))}
+
+
+def assert_same_outputs(actual, expected):
+    """Every output of ``expected`` is in ``actual``, bit for bit."""
+    for key in list(expected.keys()):  # Items would come wrapped where they are no tensors.
+        assert torch.equal(actual[key], expected[key]), key
+
+
+def make_kind(kind, **options):
+    """The losses as functions of their networks, with the networks and the data they need."""
+    deterministic = kind is TD3LagrangianLoss
+    setting = {
+        "make_networks": partial(make_q_networks, deterministic=deterministic),
+        # With as few as 12, a minibatch of SAC may hold final states alone, and skip them all.
+        "make_data": partial(make_transitions, num_transitions=32),
+    }
+    makers = (partial(each, **OWN[kind], **options) for each in (kind, PARENTS[kind]))
+    return *makers, setting

@@ -6,18 +6,11 @@ import math
 import pytest
 import torch
 from on_policy import make_loss
-from torchrl.objectives import LossModule
+from rules import make_module
 
 from torchrl_safe.objectives import DualAscent, PIDControl
 
 NAN, INF = float("nan"), float("inf")
-
-
-def make_module(*multiplier):
-    """The least a loss must have to be updated."""
-    module = LossModule()
-    module.register_buffer("lagrange_multiplier", torch.tensor(multiplier))
-    return module
 
 
 def follow(updater, *mean_costs):

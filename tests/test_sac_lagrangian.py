@@ -1,4 +1,4 @@
-"""SACLagrangianLoss: what it does not share with TD3LagrangianLoss. See test_cost_q_critics.py."""
+"""SACLagrangianLoss: what it does not share with TD3LagrangianLoss. See test_off_policy.py."""
 
 import pytest
 import torch

@@ -25,7 +25,6 @@ from torchrl_safe.objectives import (
     FOCOPSLoss,
     IPOLoss,
     LagrangianLoss,
-    MultiplierUpdater,
     P3OLoss,
     PIDControl,
     PPOLagrangianLoss,
@@ -56,15 +55,21 @@ BY_MULTIPLIER = {
     "focops": partial(FOCOPSLoss, kl_bound=1.0),
     "trust-region": TrustRegionLoss,
 }
+
+
 BY_VIOLATION = {
     "p3o": P3OLoss,
     "ipo": IPOLoss,
     "crpo": around(CRPOLoss, ClipPPOLoss),
 }
+
+
 OFF_POLICY = {
     "sac": partial(SACLagrangianLoss, target_entropy=-2.0),
     "td3": partial(TD3LagrangianLoss, bounds=(-1.0, 1.0)),
 }
+
+
 ON_POLICY_CHECKS = (
     testing.check_gradients,
     testing.check_multiplier_direction,
@@ -76,6 +81,8 @@ ON_POLICY_CHECKS = (
     testing.check_state_dict,
     testing.check_cast,
 )
+
+
 OFF_POLICY_CHECKS = (
     testing.check_gradients,
     testing.check_masked_steps,
@@ -462,83 +469,6 @@ class Counts(PPOLagrangianLoss):
 def test_a_graph_that_is_not_one():
     with pytest.raises(AssertionError, match="took 2 graphs"):
         testing.check_compile(Counts)
-
-
-# ---------------------------------------------------------------- faults of rules
-
-
-class Rule(MultiplierUpdater):
-    def next_multiplier(self, multiplier, violation):
-        return multiplier + 0.1 * violation
-
-
-class Backwards(Rule):
-    def next_multiplier(self, multiplier, violation):
-        return multiplier - 0.1 * violation
-
-
-class Together(Rule):
-    def next_multiplier(self, multiplier, violation):
-        return multiplier + 0.1 * violation * torch.tensor(1.0 + 0.1 * (len(violation) - 1))
-
-
-class Unbounded(Rule):
-    def _move(self, buffer, episode_cost):
-        buffer.add_(0.1 * self._violation(episode_cost))
-
-
-class NewTensor(Rule):
-    def _move(self, buffer, episode_cost):
-        moved = (buffer + 0.1 * self._violation(episode_cost)).clamp_min(0)
-        self.loss_module._buffers["lagrange_multiplier"] = moved
-
-
-class Trusting(Rule):
-    def step(self, episode_cost):
-        if len(episode_cost):
-            self._move(self.loss_module.lagrange_multiplier, episode_cost.nan_to_num(0.0))
-
-
-class Decays(Rule):
-    def step(self, episode_cost):
-        if not len(episode_cost):
-            self.loss_module.lagrange_multiplier.mul_(0.9)
-        super().step(episode_cost)
-
-
-class Amnesiac(Rule):
-    """Has a step size that shrinks, and forgets by how much."""
-
-    def __init__(self, *args, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.count = 1
-
-    def next_multiplier(self, multiplier, violation):
-        self.count += 1
-        return multiplier + 0.1 * violation / self.count
-
-
-@pytest.mark.parametrize(
-    ("rule", "message"),
-    [
-        (Backwards, r"cost 3 under a limit of 1 moved 1\.0 to 0\.8"),
-        (Together, "a cost moves its multiplier as it does alone"),
-        (Unbounded, "multipliers must be finite and not negative"),
-        (NewTensor, "moved|in place"),
-        (Trusting, r"a cost of NaN, .* must raise a ValueError"),
-        (Decays, "after a batch without a finished episode"),
-        (Amnesiac, "multipliers of a restored updater"),
-    ],
-)
-def test_a_faulty_rule(rule, message):
-    with pytest.raises(AssertionError, match=message):
-        testing.check_multiplier_updater(rule)
-
-
-def test_a_rule_that_does_not_find_the_optimum():
-    make = partial(PPOLagrangianLoss, entropy_bonus=False)
-    with pytest.raises(AssertionError, match=r"The probability of action A is 0\.\d+ after 10 bat"):
-        testing.check_reaches_optimum(make, partial(DualAscent, lr=1e-3), num_batches=10)
 
 
 # ---------------------------------------------------------------- factories
