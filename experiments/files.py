@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_safe._files import UNFINISHED, writing
-
-#: What to do about a folder that a run may have been stopped in.
-TO_RESUME = "To resume the run in it, add --resume with the same options."
+from torchrl_safe.checkpoint import refuse_other_settings
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -28,6 +26,30 @@ def as_json(config: Any) -> dict[str, Any]:
 def lasting(settings: Mapping[str, Any], changeable: Collection[str]) -> dict[str, Any]:
     """Those settings that a run keeps when it is resumed."""
     return {name: value for name, value in settings.items() if name not in changeable}
+
+
+def run_to_resume(config: Any, changeable: Collection[str]) -> dict[str, Any] | None:
+    """What the run in the folder ``config.out`` has finished; None if this begins one.
+
+    Args:
+        config: the settings, a dataclass with ``out`` and ``resume``.
+        changeable: names of settings that may have changed.
+
+    Raises:
+        FileExistsError: if the folder has something in it, and no run that is to be resumed.
+        ValueError: if that run has other settings.
+    """
+    path = config.out / "results.json"
+    if config.resume and path.exists():
+        before: dict[str, Any] = json.loads(path.read_text())
+        was, now = (lasting(each, changeable) for each in (before["config"], as_json(config)))
+        refuse_other_settings(was, now)
+        return before
+    to_resume = "To resume the run in it, add --resume with the same options."
+    require_new(config.out, "There is no run in it to resume." if config.resume else to_resume)
+    if config.resume:
+        print(f"There is no run in {config.out} to resume: this begins one.")
+    return None
 
 
 def require_new(folder: Path, hint: str = "") -> None:

@@ -34,10 +34,10 @@ from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, OnPolicy, keep_multiplier, move_multiplier
 from experiments.compiling import compiled
-from experiments.files import TO_RESUME, as_json, lasting, require_new, write_whole
+from experiments.files import as_json, lasting, run_to_resume, write_whole
 from experiments.learners import NOT_LEARNT_FROM, Objective, moved_from_here, summed, tell_length
 from experiments.log import Log, figures, versions
-from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
+from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.envs.gym import SafeGymEnv
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.objectives import (
@@ -485,23 +485,9 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     return agent, log
 
 
-def check_folder(config: Config) -> None:
-    """Raises unless the folder is empty, or has a run of this script that is to be resumed."""
-    path = config.out / "results.json"
-    if config.resume and path.exists():
-        before = json.loads(path.read_text())["config"]
-        if "env" in before:
-            now = as_json(config)
-            refuse_other_settings(lasting(before, CHANGEABLE), lasting(now, CHANGEABLE))
-            return
-    require_new(config.out, "There is no run in it to resume." if config.resume else TO_RESUME)
-    if config.resume:
-        print(f"There is no run in {config.out} to resume: this begins one.")
-
-
 def main(config: Config) -> dict[str, Any]:
     """Trains, evaluates, and writes the results."""
-    check_folder(config)
+    run_to_resume(config, CHANGEABLE)
     agent, log = train(config)
     seconds = log.seconds
     env = make_env(config)

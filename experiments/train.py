@@ -28,12 +28,12 @@ from tqdm import tqdm
 from experiments.algorithms import ALGORITHMS, Training, configured, own_settings
 from experiments.config import AlgorithmName, Config, command_line
 from experiments.demonstrations import CARE, start_from_demonstrations
-from experiments.files import TO_RESUME, as_json, lasting, require_new, write_whole
+from experiments.files import as_json, lasting, run_to_resume, write_whole
 from experiments.film import Policy, save_film
 from experiments.grid import side_by_side
 from experiments.log import Log, figures, progress_text, score, summed_costs, versions
 from experiments.report import plot_curves, save_picture, table
-from torchrl_safe.checkpoint import RunCheckpoints, refuse_other_settings
+from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.collectors import ResumableCollector
 from torchrl_safe.envs import (
     PAPER_CARTESIAN,
@@ -354,24 +354,14 @@ def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
 
 def start(config: Config) -> dict[str, Any]:
     """Begins a run, or reads what one that is resumed has finished."""
-    path = config.out / "results.json"
+    before = run_to_resume(config, CHANGEABLE)
     results: dict[str, Any] = {
         "config": dataclasses.asdict(config),
         "cost_limits": config.cost_limits,
-        "algorithms": {},
+        "algorithms": {} if before is None else before["algorithms"],
     }
-    if config.resume and path.exists():
-        before = json.loads(path.read_text())
-        was, now = (lasting(each["config"], CHANGEABLE) for each in (before, results))
-        refuse_other_settings(was, now)
-        results["algorithms"] = before["algorithms"]
-    elif config.resume:
-        require_new(config.out, "There is no run in it to resume.")
-        print(f"There is no run in {config.out} to resume: this begins one.")
-    else:
-        require_new(config.out, TO_RESUME)
     config.out.mkdir(parents=True, exist_ok=True)
-    write_whole(path, json.dumps(results, indent=1, default=str))
+    write_whole(config.out / "results.json", json.dumps(results, indent=1, default=str))
     return results
 
 

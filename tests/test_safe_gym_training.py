@@ -16,6 +16,7 @@ from torch.distributions import kl_divergence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from experiments import compiling, evaluate, safe_gym, safe_gym_grid
+from experiments.files import run_to_resume
 from experiments.safe_gym import Config, Critic, Standardize, main, make_agent, make_env, train
 from torchrl_safe.policy import load_policy
 
@@ -170,11 +171,11 @@ def test_resuming_with_other_settings_is_refused_before_there_is_a_checkpoint(
         with pytest.raises(KeyboardInterrupt):
             train(config, progress=False)
     assert not list(tmp_path.glob("checkpoints/*.torchrl"))
-    safe_gym.check_folder(replace(config, resume=True, eval_episodes=8))
+    run_to_resume(replace(config, resume=True, eval_episodes=8), safe_gym.CHANGEABLE)
     with pytest.raises(
         ValueError, match=r"the run has other settings: gamma was .* and is now 0.5"
     ):
-        safe_gym.check_folder(replace(config, resume=True, gamma=0.5))
+        run_to_resume(replace(config, resume=True, gamma=0.5), safe_gym.CHANGEABLE)
 
 
 def test_an_option_that_cannot_be_used_leaves_the_folder_as_it_was(tmp_path):
@@ -186,7 +187,7 @@ def test_an_option_that_cannot_be_used_leaves_the_folder_as_it_was(tmp_path):
 def test_a_run_of_another_script_is_not_overwritten(tmp_path):
     results = tmp_path / "results.json"
     results.write_text('{"config": {"envs": 32}, "algorithms": {}}')
-    with pytest.raises(FileExistsError, match="There is no run in it to resume"):
+    with pytest.raises(ValueError, match="the run has other settings: env was None and is now"):
         main(replace(SMALL, resume=True, out=tmp_path))
     assert "algorithms" in results.read_text()
 
