@@ -39,7 +39,7 @@ from torchrl_safe.envs import (
     ShieldCorrection,
     Sphere,
 )
-from torchrl_safe.envs.shield.projection import project
+from torchrl_safe.envs.shield.projection import _solve, project
 
 # With that, a control step of 1/20 s may use up this share of the room above the margin.
 SLOW = Shield(margin=0.02, rate=5.0)
@@ -86,9 +86,22 @@ def test_projections_are_the_nearest_points(seed):
             np.testing.assert_allclose(points[index], expected, atol=1e-7)
 
 
-def test_projections_know_when_there_is_no_solution():
+def nearly_dependent(seed, count=200):
+    """Half of the rows are all but combinations of the others."""
+    rng = np.random.default_rng(seed)
+    wanted, rows, _, lower, upper = problems(seed, count, unknowns=7, rows=12)
+    rows[:, 6:] = rng.normal(size=(count, 6, 6)) @ rows[:, :6] + 1e-5 * rows[:, 6:]
+    return wanted, rows, 0.3 * rng.normal(size=(count, 12)), lower, upper
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [problems(0, unknowns=7, rows=12), *(nearly_dependent(seed) for seed in range(4))],
+    ids=["any", *(f"nearly-dependent-{seed}" for seed in range(4))],
+)
+def test_projections_know_when_there_is_no_solution(arguments):
     """Of seven joints, as SciPy's linear programs have it."""
-    wanted, rows, least, lower, upper = problems(0, unknowns=7, rows=12)
+    wanted, rows, least, lower, upper = arguments
     points, solved = project(wanted, rows, least, lower, upper)
     for index in range(len(wanted)):
         bounds = list(zip(lower[index], upper[index], strict=True))
@@ -96,6 +109,13 @@ def test_projections_know_when_there_is_no_solution():
         assert solved[index] == (program.status == 0)
     assert (np.einsum("kri,ki->kr", rows, points) >= least - 1e-7)[solved].all()
     assert 0 < solved.sum() < len(solved)
+
+
+def test_equations_without_a_solution_do_not_end_the_others():
+    gram = np.stack([np.ones((2, 2)), 2 * np.eye(2)])
+    shares, singular = _solve(gram, np.ones((2, 2, 1)))
+    assert singular.tolist() == [True, False]
+    np.testing.assert_array_equal(shares[1], [0.5, 0.5])
 
 
 def test_projections_do_not_depend_on_each_other():

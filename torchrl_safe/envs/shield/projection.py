@@ -12,6 +12,11 @@ from torchrl_safe.envs.state import Array
 _ITERATIONS_PER_UNKNOWN = 8
 # Tolerances for constraints of unit length: to be beyond one, and to be parallel.
 _TOLERANCE, _PARALLEL = 1e-9, 1e-10
+# Squared length of what active constraints do not span of another. With less, they would be so
+# nearly dependent that rounding decides where they meet.
+_SPANNED = 1e-6
+# How far beyond a constraint rounding may leave a solution.
+_ROUNDING = 1e-6
 
 
 def project(
@@ -101,10 +106,10 @@ def _active_set(
         # The part of it that the active ones do not span, and how much of each is in the rest.
         gram = normals @ normals.transpose(0, 2, 1)
         gram[:, joint, joint] += ~held
-        shares = np.linalg.solve(gram, normals @ normal[:, :, None])[:, :, 0]
+        shares, singular = _solve(gram, normals @ normal[:, :, None])
         free = normal - (normals * shares[:, :, None]).sum(axis=1)
         length = (free * normal).sum(axis=1)
-        new = length > _PARALLEL
+        new = length > _SPANNED
         # How far until the constraint holds, or the multiplier of an active one is used up.
         shrinks = held & (shares > _PARALLEL)
         limits = np.where(shrinks, multipliers / np.where(shrinks, shares, 1.0), np.inf)
@@ -112,7 +117,7 @@ def _active_set(
         full = np.where(new, -missing / np.where(new, length, 1.0), np.inf)
         step = np.minimum(full, limits[each, last])
         # Neither will ever happen: there is no solution.
-        open_ &= np.isfinite(step)
+        open_ &= np.isfinite(step) & ~singular
         step = np.where(open_, step, 0.0)
         point = point + np.where(new, step, 0.0)[:, None] * free
         multipliers -= np.where(held, step[:, None] * shares, 0.0)
@@ -126,4 +131,15 @@ def _active_set(
         entering[joins], weight[joins] = -1, 0.0
         slot = last[drops]
         normals[drops, slot], multipliers[drops, slot], active[drops, slot] = 0.0, 0.0, -1
-    return point, solved
+    # Those that are active have not been looked at again.
+    return point, solved & ((rows @ point[:, :, None])[:, :, 0] >= least - _ROUNDING).all(axis=1)
+
+
+def _solve(gram: Array, right: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Solves ``(N, n, n)`` equations; also returns which have no solution, ``(N,)``."""
+    try:
+        return np.linalg.solve(gram, right)[:, :, 0], np.zeros(len(gram), dtype=bool)
+    except np.linalg.LinAlgError:  # One such problem is not the others' end.
+        singular = np.linalg.matrix_rank(gram, hermitian=True) < gram.shape[1]
+        gram = np.where(singular[:, None, None], np.eye(gram.shape[1]), gram)
+        return np.linalg.solve(gram, right)[:, :, 0], singular
