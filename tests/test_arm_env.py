@@ -16,6 +16,7 @@ from worlds import each_arm
 
 from torchrl_safe.envs import (
     ArmEnv,
+    Box,
     Bullet,
     CartesianDelta,
     Collision,
@@ -449,11 +450,27 @@ class Task(Reach):
             return self.values["drawn"]
         return self.values.get("goal", goal), objects
 
+    @property
+    def objects(self):
+        return self.values.get("objects", ())
+
     def reward(self, state):
         return self.values.get("reward", super().reward(state))
 
     def success(self, state):
         return self.values.get("success", super().success(state))
+
+
+class Mode(JointDelta):
+    """An action mode whose targets are those that it is given."""
+
+    def __init__(self, bound=1.0, **values):
+        super().__init__()
+        self.__dict__.update(bound=bound, values=values)
+
+    def targets(self, action, state, simulator):
+        joints, fingers = super().targets(action, state, simulator)
+        return self.values.get("joints", joints), self.values.get("fingers", fingers)
 
 
 @pytest.mark.parametrize(
@@ -482,6 +499,16 @@ class Task(Reach):
         ({"obstacles": Places([0.7, 0, 0])}, r"obstacle positions must have shape \(2, 3\), got"),
         ({"obstacles": Places([0.7, 0, 0], [np.nan] * 3)}, "position must be finite"),
         ({"obstacles": Places([0.7, 0, 0], HOME)}, "obstacles must leave the arm free at home"),
+        ({"action": Mode(bound=np.nan)}, "bound must be positive, got nan"),
+        (
+            {"action": Mode(joints=np.zeros(7))},
+            "joint targets of the action must have",
+        ),
+        (
+            {"action": Mode(fingers=np.zeros((1, 3)))},
+            "finger targets of the action must have",
+        ),
+        ({"task": Task(objects=(Box(),))}, "objects of task must have a mass to be moved, got Box"),
         ({"obstacles": InFront(gap=0.5)}, "gap must be less than the horizontal distance"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
@@ -499,6 +526,8 @@ def test_bad_arguments(arguments, message):
         ({"task": Reach}, "task must be an instance of Task, got <class"),
         ({"task": ()}, r"got \(\), which has no objects and no reward and no sample"),
         ({"obstacles": Cylinder()}, "obstacles must be an instance of Obstacles"),
+        ({"task": Task(objects=(3,))}, "objects of task must be an instance of Cyl.*, got 3"),
+        ({"task": Task(objects=Box())}, "objects of task must be an instance of Sequence, got Box"),
         ({"scene": None}, "scene must be an instance of Scene, got None"),
         ({"physics": Bullet}, "physics must be an instance of Physics, got <class"),
         ({"observation": FullObservation}, "observation must be a callable object, got <class"),
@@ -512,6 +541,46 @@ def test_bad_arguments(arguments, message):
 def test_arguments_of_the_wrong_kind(arguments, message):
     with pytest.raises(TypeError, match=message):
         ArmEnv(**arguments)
+
+
+def test_targets_that_are_not_finite_do_not_reach_the_motors(make_env):
+    """PyBullet would drive all joints at full speed."""
+    mode = Mode()
+    env = make_env(ArmEnv, action=mode, seed=0)
+    start = env.reset()
+    mode.values["joints"] = np.array([[np.nan, *np.zeros(6)]])
+    with pytest.raises(ValueError, match="joint targets of the action must be finite"):
+        env.step(start.set("action", torch.zeros(1, 7)))
+    np.testing.assert_array_equal(env.arm_state.joint_velocity, np.zeros((1, 7)))
+
+
+@pytest.mark.parametrize(
+    ("later", "message"),
+    [
+        (
+            lambda s: {"goal": s.goal},
+            r"observation must return the fields .*, got \{'goal'",
+        ),
+        (lambda s: {"tool": s.ee_position, "goal": s.goal}, "observation must return the fields"),
+        (lambda s: {"goal": s.goal, "tool": s.ee_position / 0}, "field 'tool' must be finite"),
+    ],
+    ids=["fewer", "order", "infinite"],
+)
+def test_fields_of_an_observation_stay_as_they_were(make_env, later, message):
+    returned = [lambda s: {"goal": s.goal, "tool": s.ee_position}]
+    env = make_env(ArmEnv, observation=lambda state: returned[-1](state), seed=0)
+    start = env.reset()
+    returned.append(later)
+    with np.errstate(divide="ignore"), pytest.raises(ValueError, match=message):
+        env.step(start.set("action", torch.zeros(1, 3)))
+
+
+@pytest.mark.parametrize("name", ["joint_lower", "joint_upper", "obstacle_size"])
+def test_what_a_state_shares_with_the_simulator_cannot_be_changed(make_env, name):
+    env = make_env(ArmEnv, seed=0)
+    env.reset()
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(env.arm_state, name)[:] = 0
 
 
 def test_numpy_integers_are_integers(make_env):

@@ -24,6 +24,7 @@ from torchrl_safe.envs import (
     PAPER_CARTESIAN,
     PAPER_JOINT,
     UR5,
+    XARM7,
     ArmEnv,
     Bullet,
     CartesianDelta,
@@ -192,10 +193,26 @@ def test_a_state_from_before_the_first_reset_has_no_episode_to_go_on_with(make_e
 
 def test_a_state_that_does_not_come_back_is_told_of(make_env):
     """By PyBullet, which plays the episodes again; MuJoCo takes the state as it was."""
-    env = make_env(ArmEnv, num_envs=1, seed=0, frame_skip=12, physics=Bullet())
+    env = make_env(ArmEnv, num_envs=1, seed=0, physics=Bullet())
     env.rollout(3)
-    other = make_env(ArmEnv, num_envs=1, frame_skip=11, physics=Bullet())
+    other = make_env(ArmEnv, num_envs=1, physics=Bullet(urdf_inertia=True))
     with pytest.warns(UserWarning, match="did not come back bit for bit"):
+        other.load_state_dict(env.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frame_skip": 6}, "whose frame_skip is 6, got 12"),
+        ({"arm": XARM7}, r"whose home is \[.*\], got \[.*\]"),
+    ],
+    ids=["frame-skip", "arm"],
+)
+def test_a_state_of_another_build_is_refused(make_env, changes, message):
+    env = make_env(ArmEnv, num_envs=1, seed=0)
+    env.rollout(3)
+    other = make_env(ArmEnv, num_envs=1, **changes)
+    with pytest.raises(ValueError, match=message):
         other.load_state_dict(env.state_dict())
 
 

@@ -271,6 +271,12 @@ def test_on_table_is_a_share(share):
         PickAndPlace(on_table=share)
 
 
+def test_fingers_close_on_what_is_as_wide_as_deep():
+    assert PickAndPlace(shape=Cylinder(0.025, 0.03, mass=0.1)).objects[0].radius == 0.025
+    with pytest.raises(ValueError, match="shape must be as wide along x as along y"):
+        PickAndPlace(shape=Box((0.02, 0.03, 0.02), mass=0.1))
+
+
 def test_picking_needs_fingers():
     with pytest.raises(ValueError, match="action must move the fingers to pick something up"):
         ArmEnv(task=PickAndPlace())

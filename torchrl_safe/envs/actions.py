@@ -105,7 +105,7 @@ class CartesianDelta:
 
     def __post_init__(self) -> None:
         check_positive(step=self.step)
-        _check_bound(self.bound)
+        check_bound(self.bound)
         if not callable(self.inverse_kinematics):
             raise TypeError(
                 f"inverse_kinematics must be callable, got {self.inverse_kinematics!r}."
@@ -189,7 +189,7 @@ class JointDelta:
 
     def __post_init__(self) -> None:
         check_positive(step=self.step)
-        _check_bound(self.bound)
+        check_bound(self.bound)
         check_flag(respect_limits=self.respect_limits)
         if self.finger_step is not None:
             check_positive(finger_step=self.finger_step)
@@ -218,7 +218,8 @@ def _finger_targets(action: Array, state: ArmState, step: float | None) -> Array
     return np.repeat(step * action[:, -1:], fingers, axis=1)
 
 
-def _check_bound(bound: float) -> None:
+def check_bound(bound: float) -> None:
+    """Raises ValueError unless a bound is positive, and infinite or a number of float32."""
     try:
         usable = isinstance(bound, Real) and float(bound) > 0
     except OverflowError:  # An integer too large for a float.

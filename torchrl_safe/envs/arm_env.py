@@ -18,12 +18,13 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_safe._checks import check_array, check_count, check_kind
-from torchrl_safe.envs.actions import ActionMode, CartesianDelta
+from torchrl_safe.envs.actions import ActionMode, CartesianDelta, check_bound
 from torchrl_safe.envs.arms import PANDA, ArmModel
 from torchrl_safe.envs.costs import Collision
 from torchrl_safe.envs.generators import PACKED_SIZE, pack, unpack
 from torchrl_safe.envs.observations import FullObservation
 from torchrl_safe.envs.obstacles import InFront, Obstacles
+from torchrl_safe.envs.obstacles.shapes import check_shapes
 from torchrl_safe.envs.physics.bullet import Bullet
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Physics
@@ -73,7 +74,8 @@ class ArmEnv(EnvBase):
         observation (Callable, optional): maps the state to named fields, which are
             concatenated. Defaults to :class:`~torchrl_safe.envs.FullObservation`.
         frame_skip (int, optional): physics substeps of 1/240 s for each action. Defaults to
-            ``12``: a control rate of 20 Hz.
+            ``12``: a control rate of 20 Hz. With fewer than 6 the arm lags behind its actions:
+            with 1 it does two thirds of each.
         max_episode_steps (int, optional): time limit; sets ``truncated``. Defaults to ``40``,
             2 s at 20 Hz.
         scene (Scene, optional): gravity, fingers and motors. Defaults to ``Scene()``.
@@ -145,6 +147,9 @@ class ArmEnv(EnvBase):
         for name, function in [*named, ("observation", observation)]:
             if isinstance(function, type) or not callable(function):
                 raise TypeError(f"{name} must be a callable object, got {function!r}.")
+        check_bound(action.bound)
+        check_shapes("shapes of obstacles", obstacles.shapes)
+        check_shapes("objects of task", task.objects, movable=True)
         super().__init__(device=device, batch_size=(num_envs,))
         self.arm = arm
         self.action_mode = action
@@ -223,13 +228,8 @@ class ArmEnv(EnvBase):
             self._reset_world(row, np.random.default_rng(0))
         self._state = state = self._read_state()
         # Checks once what the arguments compute, so that errors show when the environment is made.
-        joints = state.joint_position.shape[1]
-        width = self.action_mode.width(joints)
-        check_array(
-            "joint targets of the action",
-            self.action_mode.targets(np.zeros((self.num_envs, width)), state, self._simulator)[0],
-            (self.num_envs, joints),
-        )
+        action_width = self.action_mode.width(state.joint_position.shape[1])
+        self._targets(np.zeros((self.num_envs, action_width)))
         self._outcome(replace(state, previous=state))  # Rewards may read what has changed.
         fields = self.observation(state)
         check_kind("what observation returns", fields, Mapping)
@@ -241,10 +241,11 @@ class ArmEnv(EnvBase):
                 raise ValueError(
                     f"observation field {name!r} must have shape (num_envs, width), got {shape}."
                 )
-        ends = np.cumsum([field.shape[1] for field in fields.values()])
+        self._field_shapes = [(name, np.shape(field)) for name, field in fields.items()]
+        ends = np.cumsum([width for _, (_, width) in self._field_shapes])
         self.observation_fields = {
-            name: slice(int(end) - field.shape[1], int(end))
-            for (name, field), end in zip(fields.items(), ends, strict=True)
+            name: slice(int(end) - width, int(end))
+            for (name, (_, width)), end in zip(self._field_shapes, ends, strict=True)
         }
         batch, device = self.batch_size, self.device
         unbounded = partial(Unbounded, device=device, dtype=torch.float32)
@@ -257,11 +258,11 @@ class ArmEnv(EnvBase):
             **({} if self.shield is None else {"shield_correction": unbounded((*batch, 1))}),
             shape=batch,
         )
-        bound, self._action_shape = self.action_mode.bound, (*batch, width)
+        bound, self._action_shape = self.action_mode.bound, (*batch, action_width)
         self.action_spec = (
-            Bounded(-bound, bound, (*batch, width), device=device, dtype=torch.float32)
+            Bounded(-bound, bound, self._action_shape, device=device, dtype=torch.float32)
             if np.isfinite(bound)
-            else unbounded((*batch, width))
+            else unbounded(self._action_shape)
         )
         self.reward_spec = Composite(
             reward=unbounded((*batch, 1)),
@@ -299,7 +300,7 @@ class ArmEnv(EnvBase):
         if not self._begun:
             raise RuntimeError("ArmEnv must be reset before its first step.")
         action = self._check_action(tensordict["action"])
-        joints, fingers = self.action_mode.targets(action, self._state, self._simulator)
+        joints, fingers = self._targets(action)
         if self.scene.motor_limits:
             joints, fingers = self._within_speed(joints, fingers)
         if self.shield is not None:
@@ -344,6 +345,8 @@ class ArmEnv(EnvBase):
         arrays = {
             "generators": np.stack([pack(generator) for generator in self._generators]),
             "draws": self._draws,
+            "frame_skip": np.full(self.num_envs, self.frame_skip),
+            "home": np.tile(np.asarray(self.arm.home, dtype=float), (self.num_envs, 1)),
             "begun": np.full(self.num_envs, self._begun),
             **({} if self.shield is None else self._shield_state()),
             **{_PHYSICS + name: array for name, array in self._simulator.save().items()},
@@ -366,6 +369,12 @@ class ArmEnv(EnvBase):
                 f"state must be of an environment like this one, of {self.num_envs} worlds, got "
                 f"{len(state['draws'])}."
             )
+        for name in ("frame_skip", "home"):
+            if not torch.equal(state[name].cpu(), own[name]):
+                raise ValueError(
+                    f"state must be of an environment like this one, whose {name} is "
+                    f"{own[name][0].tolist()}, got {state[name][0].tolist()}."
+                )
         try:
             self._restore(state)
         except Exception:
@@ -448,6 +457,14 @@ class ArmEnv(EnvBase):
             raise ValueError(f"action must be finite, got NaN or infinity in rows {rows}.")
         return np.clip(array, -self.action_mode.bound, self.action_mode.bound)
 
+    def _targets(self, action: Array) -> tuple[Array, Array]:
+        joints, fingers = self.action_mode.targets(action, self._state, self._simulator)
+        count = len(self._simulator.finger_speed) if np.size(fingers) else 0
+        return (
+            check_array("joint targets of the action", joints, self._state.joint_position.shape),
+            check_array("finger targets of the action", fingers, (self.num_envs, count)),
+        )
+
     def _within_speed(self, joints: Array, fingers: Array) -> tuple[Array, Array]:
         # All joints are slowed alike, so that the tool keeps to its path.
         simulator, state = self._simulator, self._state
@@ -498,9 +515,20 @@ class ArmEnv(EnvBase):
         )
 
     def _observe(self, state: ArmState) -> Array:
-        fields = self.observation(state).values()
-        observation = np.concatenate([*fields], axis=1)
-        return check_array("observation", observation, observation.shape)
+        fields = self.observation(state)
+        if [(name, np.shape(field)) for name, field in fields.items()] != self._field_shapes:
+            now = {name: np.shape(field) for name, field in fields.items()}
+            raise ValueError(
+                f"observation must return the fields {dict(self._field_shapes)} in every step, "
+                f"got {now}."
+            )
+        observation = np.concatenate([*fields.values()], axis=1)
+        try:
+            return check_array("observation", observation, observation.shape)
+        except ValueError:
+            for name, field in fields.items():
+                check_array(f"observation field {name!r}", field, np.shape(field))
+            raise
 
     def _outcome(self, state: ArmState) -> tuple[Array, Array, np.ndarray]:
         """Reward (N, 1), costs (N, k) and success (N, 1) of a state."""

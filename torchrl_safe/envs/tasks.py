@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Real
@@ -237,15 +238,15 @@ class PickAndPlace:
         radius: distance between cube and goal at which the task is done, m.
         distance: smallest horizontal distance between cube and goal at the start, m.
         on_table: share of the goals that lie on the table.
-        shape: the object; it starts upright on the table.
+        shape: the object, as wide along x as along y; it starts upright on the table.
         shaped: reward progress. ``False`` rewards with minus the distance between cube and goal,
             in metres, as panda-gym does.
         sparse: reward each step with -1 until success and 0 at success, instead.
 
     Raises:
         TypeError: if ``region`` or ``shape`` is not of its kind.
-        ValueError: if a length is not positive, the shape has no mass or ``on_table`` is not a
-            share; in :meth:`reward`, if the action does not move the fingers.
+        ValueError: if a length is not positive, the shape has no mass or another width than depth,
+            or ``on_table`` is not a share; in :meth:`reward`, if the fingers are fixed.
         NoRoomError: in :meth:`sample`, if the region is too small for the distance.
 
     Examples:
@@ -265,6 +266,12 @@ class PickAndPlace:
         _check(self.region, self.radius)
         check_flag(shaped=self.shaped, sparse=self.sparse)
         _check_object(self.shape)
+        deep, wide, _ = self.shape.half_extents
+        if not math.isclose(deep, wide, rel_tol=0.01):
+            raise ValueError(
+                "shape must be as wide along x as along y, for the fingers to close on it from any "
+                f"side, got {self.shape}."
+            )
         _check_distance(self.distance, self.radius)
         if not isinstance(self.on_table, Real) or not 0 <= self.on_table <= 1:
             raise ValueError(f"on_table must be between 0 and 1, got {self.on_table!r}.")
@@ -296,7 +303,7 @@ class PickAndPlace:
     def _way(self, state: ArmState) -> Array:
         """How far it is still to go, m."""
         from_object = state.ee_position - state.object_position[:, 0]
-        distance, half = np.linalg.norm(from_object, axis=1), min(self.shape.half_extents)
+        distance, half = np.linalg.norm(from_object, axis=1), self.shape.half_extents[0]
         beside = np.linalg.norm(from_object[:, :2], axis=1)
         too_low = np.maximum(0, np.minimum(beside, _ABOVE) - from_object[:, 2])
         opening = state.finger_position.mean(axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -218,3 +219,12 @@ def footprint(shape: Shape) -> float:
             return float(np.hypot(*shape.half_extents[:2]))
         case Cylinder() | Sphere() | Capsule():
             return shape.radius
+
+
+def check_shapes(name: str, shapes: Sequence[Shape], *, movable: bool = False) -> None:
+    """Raises TypeError unless these are shapes, ValueError unless they have a mass if movable."""
+    check_kind(name, shapes, Sequence)
+    for shape in shapes:
+        check_kind(name, shape, Shape)
+        if movable and not shape.mass:
+            raise ValueError(f"{name} must have a mass to be moved, got {shape}.")

@@ -15,7 +15,7 @@ class Scene:
     """The world around the arm, whichever engine simulates it.
 
     Args:
-        gravity: m/s^2, downwards.
+        gravity: m/s^2, downwards. MuJoCo's motors compensate for the weight of the arm.
         free_fingers: leave the joints that are not part of the arm movable.
         motor_limits: keep the motors within the efforts and speeds of the URDF.
         motor_strength: share of the URDF's efforts that the motors have.

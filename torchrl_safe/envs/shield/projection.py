@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,7 +137,7 @@ def _active_set(
     return point, solved & ((rows @ point[:, :, None])[:, :, 0] >= least - _ROUNDING).all(axis=1)
 
 
-def _solve(gram: Array, right: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _solve(gram: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Solves ``(N, n, n)`` equations; also returns which have no solution, ``(N,)``."""
     try:
         return np.linalg.solve(gram, right)[:, :, 0], np.zeros(len(gram), dtype=bool)

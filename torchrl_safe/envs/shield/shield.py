@@ -144,7 +144,8 @@ class Shield:
             m/s, and the arm is not the one that moves into contact. ``None`` expects them to keep
             their velocity.
         workspace: if given, the tool point stays in this box, the margin away from its walls. If
-            it begins outside, it moves in.
+            it begins outside, it moves in. Where there is no solution, a fast tool may leave it by
+            a centimetre while the arm brakes.
 
     Raises:
         TypeError: if ``workspace`` is not a Region.

@@ -180,10 +180,7 @@ def load_furniture(
 ) -> list[int]:
     """Loads URDF files of ``pybullet_data``, or if there are none a table with top at height 0."""
     if furniture:
-        return [
-            pybullet.loadURDF(_data(urdf), position, useFixedBase=True, physicsClientId=client)
-            for urdf, position in furniture
-        ]
+        return [load_body(client, urdf, position, fixed=True) for urdf, position in furniture]
     table = Box(half_extents=(0.75, 0.6, 0.025))
     body = add_shape(client, table, (0.5, 0, -0.025), TABLE if visuals else None)
     if visuals:
@@ -206,9 +203,12 @@ def scale_dynamics(client: int, body: int, *, mass: float = 1.0, friction: float
         )
 
 
-def load_body(client: int, urdf: str, position: Sequence[float]) -> int:
-    """Loads a URDF file of ``pybullet_data`` that is free to move."""
-    return pybullet.loadURDF(_data(urdf), position, physicsClientId=client)
+def load_body(client: int, urdf: str, position: Sequence[float], *, fixed: bool = False) -> int:
+    """Loads a URDF file of ``pybullet_data``, free to move unless fixed."""
+    try:
+        return pybullet.loadURDF(_data(urdf), position, useFixedBase=fixed, physicsClientId=client)
+    except pybullet.error as error:
+        raise ValueError(f"urdf {urdf!r} does not load in PyBullet.") from error
 
 
 def add_shape(client: int, shape: Shape, position: Sequence[float], default: Colour | None) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from torchrl_safe._checks import check_flag, check_positive
+from torchrl_safe._checks import check_array, check_flag, check_kind, check_positive
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.simulator import BulletSimulator
@@ -37,8 +37,9 @@ class Bullet:
             physics substep late, as PyBullet does by default.
 
     Raises:
-        TypeError: if a flag is not True or False.
-        ValueError: if ``motor_gain`` is not a share.
+        TypeError: if a flag is not True or False, or a file or its position is none.
+        ValueError: if ``motor_gain`` is not a share, or a position is not three finite numbers. A
+            file that does not load raises it where the world is built.
 
     Examples:
         >>> Bullet(motor_gain=0.1).merged_links
@@ -57,6 +58,12 @@ class Bullet:
             check_positive(motor_gain=self.motor_gain)
             if self.motor_gain > 1:
                 raise ValueError(f"motor_gain must be at most 1, got {self.motor_gain}.")
+        for each in self.furniture:
+            if not isinstance(each, tuple) or len(each) != 2 or not isinstance(each[0], str):
+                raise TypeError(f"furniture must be pairs of a file and a position, got {each!r}.")
+            check_array("position of furniture", each[1], (3,))
+        if self.target_urdf is not None:
+            check_kind("target_urdf", self.target_urdf, str)
         check_flag(
             merged_links=self.merged_links,
             urdf_inertia=self.urdf_inertia,

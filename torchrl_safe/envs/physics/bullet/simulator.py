@@ -84,6 +84,8 @@ class BulletSimulator:
         self.home_position: Array = np.array(first.home_position)
         self.home_orientation: Array = np.array(first.home_orientation)
         self._sizes = np.array([shape.half_extents for shape in shapes]).reshape(-1, 3)
+        for array in (self.joint_lower, self.joint_upper, self._sizes):
+            array.setflags(write=False)  # States have them, and whoever reads a state.
         self._places = places(first.read_shapes())
         self._trace_places = places(first.trace_shapes())
         self._targets = TargetRecord(num_envs)

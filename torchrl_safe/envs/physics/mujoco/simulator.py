@@ -98,6 +98,8 @@ class MuJoCoSimulator:
         self.home_position, self.home_orientation = home.position[0], home.orientation[0]
 
         self._sizes = np.array([shape.half_extents for shape in shapes]).reshape(-1, 3)
+        for array in (self.joint_lower, self.joint_upper, self._sizes):
+            array.setflags(write=False)  # States have them, and whoever reads a state.
         self._is_free = np.array([shape.mass > 0 for shape in shapes], dtype=bool)
         self._some_free = bool(self._is_free.any())
         self._tracks = Tracks(num_envs, len(shapes), frame_skip)
@@ -365,7 +367,6 @@ class MuJoCoSimulator:
         return {
             "state": self._batch.state.copy(),
             "steps": self._steps.copy(),
-            "frame_skip": np.full_like(self._steps, self._frame_skip),
             "contact_distance": self._contact_distance.copy(),
             "contact_force": self._contact_force.copy(),
             **{f"trace_{name}": values.copy() for name, values in self._trace.items()},
@@ -381,11 +382,6 @@ class MuJoCoSimulator:
                     f"{name} must be of an environment like this one, whose worlds have the shape "
                     f"{own[name].shape}, got {shape}."
                 )
-        if (saved["frame_skip"] != self._frame_skip).any():
-            raise ValueError(
-                f"frame_skip must be that of the saved episodes, {saved['frame_skip'][0]}, got "
-                f"{self._frame_skip}."
-            )
         self._steps[:] = saved["steps"]
         for row, steps in enumerate(self._steps.tolist()):
             self._tracks.seek(row, steps * self._frame_skip)
