@@ -11,9 +11,9 @@ OMNISAFE_FILE := tests/with_safety_gymnasium/omnisafe.txt
 
 # What rounds differently from one processor to the next: losses, trust region, multipliers, metrics.
 NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrained_optimum cost_gae \
-	cost_td0 family first_order first_order_interface functional lagrangian metrics multipliers \
-	multipliers_interface off_policy off_policy_interface offpolicy_optimum pid_control ppo_lagrangian \
-	ppo_lagrangian_interface sac_lagrangian trust_region trust_region_loss trust_region_optimum \
+	cost_td0 default_rule family first_order first_order_interface functional lagrangian learners metrics \
+	multi_agent multipliers multipliers_interface off_policy off_policy_interface offpolicy_optimum \
+	pid_control ppo_cases ppo_lagrangian ppo_lagrangian_interface sac_lagrangian scaling trust_region trust_region_loss trust_region_optimum \
 	trust_region_refusals trust_region_step violation))
 
 .PHONY: train test test-kernels test-slow test-wheel test-safety-gymnasium safe-gym safe-gym-grid \

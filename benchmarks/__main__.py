@@ -18,16 +18,17 @@ class Config:
     parts: tuple[Part, ...] = PARTS
     """What to measure."""
     quick: bool = False
-    """Only try whether everything runs: the figures mean nothing."""
+    """Only try whether everything runs: the figures mean nothing, and are not written down."""
     out: Path = Path("runs/benchmarks")
     """Folder of results.json and table.md; parts that are not measured keep their figures."""
 
 
 def main(config: Config) -> None:
-    """Measures part by part and writes down each at once."""
+    """Measures part by part, and writes down each at once."""
     for part in config.parts:
         figures = measure_apart(part, quick=config.quick)
-        record(part, figures, config.out)
+        if not config.quick:
+            record(part, figures, config.out)
         print(f"## {part}\n\n{table(figures)}\n", flush=True)
 
 

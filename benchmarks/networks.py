@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
-from torchrl.modules import MLP, Actor, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
 #: Widths of ArmEnv's observation and action with one obstacle and seven joints.
 OBSERVATION, ACTION = 40, 7
@@ -33,20 +33,6 @@ def make_critic(out_key: str) -> ValueOperator:
     return ValueOperator(network(1), in_keys=["observation"], out_keys=[out_key])
 
 
-def make_q_critic(out_key: str) -> ValueOperator:
-    """A critic of observations and actions with one output."""
-    return ValueOperator(
-        MLP(OBSERVATION + ACTION, 1, num_cells=[64, 64], activation_class=nn.Tanh),
-        in_keys=["observation", "action"],
-        out_keys=[out_key],
-    )
-
-
-def make_deterministic_actor() -> Actor:
-    """A policy without noise, within (-1, 1)."""
-    return Actor(nn.Sequential(network(ACTION), nn.Tanh()))
-
-
 def make_minibatch(size: int) -> TensorDict:
     """Made-up control steps with advantages and value targets, as they come from a buffer."""
     data = TensorDict(observation=torch.randn(size, OBSERVATION), batch_size=[size])
@@ -55,22 +41,3 @@ def make_minibatch(size: int) -> TensorDict:
     for key in ("advantage", "value_target", "cost_advantage", "cost_value_target"):
         data[key] = torch.randn(size, 1)
     return data.exclude("loc", "scale")
-
-
-def make_transitions(size: int) -> TensorDict:
-    """Made-up transitions, as they come from the buffer of an off-policy loss."""
-    done = torch.zeros(size, 1, dtype=torch.bool)
-    following = TensorDict(
-        observation=torch.randn(size, OBSERVATION),
-        reward=torch.randn(size, 1),
-        cost=torch.rand(size, 1),
-        done=done,
-        terminated=done,
-        batch_size=[size],
-    )
-    return TensorDict(
-        observation=torch.randn(size, OBSERVATION),
-        action=2 * torch.rand(size, ACTION) - 1,
-        next=following,
-        batch_size=[size],
-    )

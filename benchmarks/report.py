@@ -16,7 +16,8 @@ from typing import Any
 from experiments.files import write_whole
 
 _PACKAGES = (
-    "torch", "torchrl", "tensordict", "pybullet", "numpy", "panda-gym", "stable-baselines3", "ray",
+    "torch", "torchrl", "tensordict", "pybullet", "mujoco", "gymnasium", "numpy", "panda-gym",
+    "stable-baselines3", "ray",
     # Without it, tensordict looks for it on the disk whenever a module writes a key.
     "pandas",
 )  # fmt: skip

@@ -305,6 +305,8 @@ def test_rotation_vector_takes_the_short_way():
         (lambda: Scene(gravity=-9.81), "gravity must be finite and not negative, got -9.81"),
         (lambda: Bullet(motor_gain=0), "motor_gain must be positive and finite, got 0"),
         (lambda: Bullet(motor_gain=5.0), "motor_gain must be at most 1, got 5.0"),
+        (lambda: Bullet(furniture=(("plane.urdf", (0, 0)),)), "position of furniture must have"),
+        (lambda: ArmEnv(physics=Bullet(target_urdf="no.urdf")), "urdf 'no.urdf' does not load"),
         (
             lambda: CartesianDelta(orientation=(1, 0, 0, 0), rotation_step=1),
             r"give one of them, got \(1, 0, 0, 0\) and 1",
@@ -320,6 +322,22 @@ def test_rotation_vector_takes_the_short_way():
 )
 def test_bad_arguments(make, message):
     with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: CartesianDelta(inverse_kinematics=3),
+            "inverse_kinematics must be callable",
+        ),
+        (lambda: Bullet(furniture=("plane.urdf",)), "furniture must be pairs of a file and a pos"),
+        (lambda: Bullet(target_urdf=3), "target_urdf must be an instance of str, got 3"),
+    ],
+)
+def test_arguments_of_the_wrong_kind(make, message):
+    with pytest.raises(TypeError, match=message):
         make()
 
 
@@ -349,8 +367,7 @@ def test_yaw_turns_the_tool_about_the_vertical(make_env, arm):
             step(env, [0, 0, 0, sign])
             assert heading(env)[2, 2] < -0.999
         angle, axis = angle_between(before, heading(env))
-        # The motors come within a third of what they are asked for.
-        assert 0.3 < angle < 0.52
+        assert angle == pytest.approx(0.5, abs=0.01)
         assert sign * axis[2] > 0.99 * np.linalg.norm(axis)
         assert np.linalg.norm(env.arm_state.ee_position[0] - place) < 0.01
     assert angle_between(start, heading(env))[0] < 0.05
@@ -367,7 +384,7 @@ def test_rotation_turns_the_tool_about_each_axis(make_env, arm, index):
     for _ in range(6):
         step(env, np.eye(6)[3 + index])
     angle, axis = angle_between(before, heading(env))
-    assert 0.15 < angle < 0.32
+    assert angle == pytest.approx(0.3, abs=0.015)
     assert axis[index] > 0.97 * np.linalg.norm(axis)
     assert np.linalg.norm(env.arm_state.ee_position[0] - place) < 0.015
 

@@ -141,6 +141,6 @@ def test_part_runs(part):
 # One part compiles a loss; PyTorch's compiler uses what PyTorch and TorchRL have deprecated.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["env", "bullet", "training", "make_train"])
+@pytest.mark.parametrize("part", ["env", "bullet", "scaling", "training", "make_train"])
 def test_long_part_runs(part):
     test_part_runs(part)

@@ -49,6 +49,12 @@ def test_the_last_two_and_the_best_are_kept(run, net):
     assert net.weight.unique().tolist() == [2]
 
 
+def test_as_many_are_kept_as_asked_for(tmp_path, net):
+    run = RunCheckpoints(tmp_path, {"net": net}, keep_last=3)
+    paths = [save(run, net, step) for step in range(5)]
+    assert sorted(tmp_path.iterdir()) == paths[2:]
+
+
 def test_without_checkpoints_nothing_is_loaded(run, net):
     before = net.weight.clone()
     assert run.load() is None

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import torchrl
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.collectors import Collector, MultiSyncCollector, _multi_sync
@@ -151,11 +150,11 @@ def test_parallel_environment_whose_worker_dies(code):
     assert all_gone(workers)
 
 
-def test_parallel_environment_whose_worker_hangs(monkeypatch):
-    """``BATCHED_PIPE_TIMEOUT=1`` in the environment; it is 10,000 seconds otherwise."""
-    monkeypatch.setattr(torchrl._utils, "BATCHED_PIPE_TIMEOUT", 1)
+def test_parallel_environment_whose_worker_hangs():
+    """As with ``BATCHED_PIPE_TIMEOUT=1`` in the environment; it is 10,000 seconds otherwise."""
     env = parallel(arm, arm)
     env.reset()
+    env.BATCHED_PIPE_TIMEOUT = 1  # Workers may take longer to start.
     workers = list(env._workers)
     os.kill(workers[1].pid, signal.SIGSTOP)
     with pytest.raises(RuntimeError, match="within the 1 sec time limit"):
@@ -208,7 +207,7 @@ def blind(state):
         ({"cost": Fails(calls=1, value=1e39)}, "cost 'cost' must be finite"),
         ({"cost": Fails(calls=1, value=np.inf)}, "cost 'cost' must be finite"),
         ({"task": Lost()}, "reward must be finite"),
-        ({"observation": blind}, "observation must be finite"),
+        ({"observation": blind}, "observation field 'to_goal' must be finite"),
     ],
     ids=["cost", "cost-beyond-float32", "infinite-cost", "reward", "observation"],
 )
@@ -253,7 +252,7 @@ def descend(loss, data, optimizer):
     """A step as docs/robustness.md recommends it."""
     losses = loss(data)
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-    torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0, error_if_nonfinite=True)
+    torch.nn.utils.clip_grad_norm_(loss.parameters(), torch.inf, error_if_nonfinite=True)
     optimizer.step()
     optimizer.zero_grad()
 
@@ -328,6 +327,7 @@ def test_no_algorithm_takes_a_step_with_nan(algorithm, key, batch, small):
     before = copy_of(training.loss.parameters())
     with pytest.raises((RuntimeError, ValueError), match="finite"):
         training.learner.learn(with_nan(batch, key))
+    # Of SAC's many small steps those before the one that meets the NaN are taken.
     assert all_equal(training.loss.parameters(), before) or algorithm == "sac-lagrangian"
     assert all(parameter.isfinite().all() for parameter in training.loss.parameters())
 

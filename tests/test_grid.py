@@ -77,7 +77,9 @@ def sleep_side_by_side(folder):
 
 def sleepers(folder):
     """The two processes, once both are there."""
+    deadline = time.monotonic() + 60
     while len(found := list(folder.iterdir())) < 2:
+        assert time.monotonic() < deadline, f"{found} began"
         time.sleep(0.01)
     return [int(path.name.split("-")[1]) for path in found]
 
@@ -95,7 +97,7 @@ def test_an_interrupt_of_this_process_alone_ends_all(tmp_path):
         sleepers(tmp_path)
         os.kill(os.getpid(), signal.SIGINT)
 
-    thread = threading.Thread(target=interrupt)
+    thread = threading.Thread(target=interrupt, daemon=True)
     thread.start()
     with pytest.raises(KeyboardInterrupt):
         sleep_side_by_side(tmp_path)

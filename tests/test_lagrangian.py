@@ -164,16 +164,6 @@ def test_every_rule_moves_the_multiplier(rule):
 # ---------------------------------------------------------------- gradients, keys, state
 
 
-@every_parent
-def test_each_network_is_trained_by_its_own_loss(parent):
-    loss = wrap(parent, 2, multiplier_init=0.7)
-    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
-    loss(data)["loss_cost_critic"].sum().backward()
-    reached = {name for name, p in loss.named_parameters() if p.grad is not None and p.grad.any()}
-    assert reached
-    assert all(name.startswith("cost_critic_network") for name in reached)
-
-
 @pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
 @pytest.mark.parametrize("parent", [A2CLoss, ClipPPOLoss])
 def test_only_the_policy_trains_a_shared_trunk_with_separate_losses(parent, separate):

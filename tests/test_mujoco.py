@@ -8,7 +8,7 @@ import pytest
 import torch
 from programs import run_code
 from tensordict import TensorDict
-from worlds import ARMS, Places, each_arm, rest, step
+from worlds import Places, each_arm, rest, step
 
 from torchrl_safe.envs import (
     IIWA,
@@ -425,18 +425,3 @@ def test_pictures_show_what_there_is(make_env, arm):
     rest(env)
     step(env, 1.0)
     assert not torch.equal(env.render(320, 240, above), first)
-
-
-def test_arms_of_the_gymnasium_names_all_load():
-    assert len(ARMS) == 6
-
-
-def test_boxes_have_their_weight(make_env, turntable):
-    """Two boxes at rest on the bar: a contact each, whose force is what they weigh."""
-    heavy, light = Box((0.04, 0.04, 0.04), mass=2.0), Box((0.04, 0.04, 0.04), mass=0.5)
-    turntable["obstacles"] = Places(heavy, light, at=[(0.15, 0, 0.561), (-0.15, 0, 0.561)])
-    env = make_env(ArmEnv, **turntable, physics=ONE)
-    env.reset()
-    rest(env, 40)
-    np.testing.assert_allclose(env.arm_state.contact_force, [[19.62, 4.905]], rtol=0.02)
-    assert (np.abs(env.arm_state.contact_distance) < 2e-3).all()

@@ -240,7 +240,7 @@ def test_what_is_done_in_one_is_done_in_the_other(make_env, arm, physics, task):
 
 
 @pytest.mark.parametrize("arm", [PANDA, UR5], ids=["panda", "ur5"])
-def test_objects_slide_alike(make_env, arm):
+def test_mujocos_objects_slide_as_far_as_friction_says(make_env, arm):
     """A cube that is let go at a speed: friction with the table stops it after v^2 / (2 mu g)."""
     env = make_env(ArmEnv, arm, physics=ONE, task=Push(), obstacles=NoObstacles(), seed=0)
     env.reset()

@@ -63,6 +63,11 @@ def test_a_cost_that_overflows_leaves_the_optimizer_as_it_was(adam):
     assert_unchanged(adam, before)
 
 
+def test_a_cost_that_is_no_tensor_is_refused(adam):
+    with pytest.raises(TypeError, match=r"episode_cost must be a tensor, got \[\[1.0, 2.0\]\]"):
+        adam.step([[1.0, 2.0]])
+
+
 @pytest.mark.parametrize(
     "shape", [(), (2,), (5, 1), (5, 3), (5, 2, 1), (0,)], ids=lambda shape: f"{shape}"
 )

@@ -415,12 +415,3 @@ def test_the_multiplier_is_a_buffer_and_no_parameter(kind):
     assert loss.lagrange_multiplier.tolist() == [0.5, 0.5]
     assert loss.lagrange_multiplier.data_ptr() == address
     assert losses["lagrange_multiplier_0"].item() == 1.5
-
-
-# ---------------------------------------------------------------- keys
-
-
-VALUE_KEYS = {
-    "state_action_value": "state_action_value",
-    "state_action_cost_value": "state_action_cost_value",
-}

@@ -276,6 +276,16 @@ def test_observations_that_are_refused(policy, observation, message):
         policy(observation)
 
 
+def test_a_tensordict_is_refused(policy):
+    with pytest.raises(TypeError, match="observation must be an array, got a TensorDict"):
+        policy(TensorDict(observation=OBSERVATIONS[:1]))
+
+
+def test_the_actor_names_an_observation_of_another_shape(policy):
+    with pytest.raises(ValueError, match=r"observation must end in shape \(40,\), got \(41,\)"):
+        policy.actor(TensorDict(observation=torch.zeros(2, 41), batch_size=[2]))
+
+
 def test_observations_of_all_kinds(policy):
     observation = OBSERVATIONS[0].numpy()
     expected = policy(observation)

@@ -46,6 +46,16 @@ def test_a_camera_may_look_straight_down_and_from_afar(make_env, eye, physics):
     assert len(picture.reshape(-1, 3).unique(dim=0)) > 1  # Not the background alone.
 
 
+@pytest.mark.parametrize("physics", [Bullet(), MuJoCo(threads=1)], ids=["bullet", "mujoco"])
+def test_shadows_are_dark(make_env, physics):
+    env = make_env(ArmEnv, physics=physics, seed=0)
+    env.reset()
+    without, with_shadows = (
+        env.render(64, 48, Camera(shadows=shadows)).float().mean() for shadows in (False, True)
+    )
+    assert with_shadows < without - 1
+
+
 def test_render_wants_a_camera(make_env):
     env = make_env(ArmEnv)
     with pytest.raises(TypeError, match="camera must be an instance of Camera, got 'above'"):

@@ -437,6 +437,7 @@ def test_weight_is_a_force(make_env, turntable):
     assert (env.arm_state.contact_force == 0).all()
     result = rest(env, 40)
     np.testing.assert_allclose(env.arm_state.contact_force, [[19.62, 4.905]], rtol=0.02)
+    assert (np.abs(env.arm_state.contact_distance) < 2e-3).all()
     assert result["cost"].tolist() == [[1, 0]]
     assert (np.abs(env.arm_state.obstacle_velocity) < 1e-3).all()
 

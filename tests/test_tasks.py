@@ -20,7 +20,6 @@ from torchrl_safe.envs import (
 
 pytestmark = pytest.mark.usefixtures("engine")
 
-CUBE = Box((0.02, 0.02, 0.02), mass=1.0)
 GRIP = CartesianDelta(finger_step=0.04)
 each_object_task = pytest.mark.parametrize("kind", [Push, PickAndPlace])
 

@@ -540,8 +540,10 @@ def test_a_minibatch_is_standardized():
 
 
 def test_td3_and_sac_get_the_actors_they_need():
-    parents = {"sac": partial(SACLoss, target_entropy=-2.0), "td3": TD3Loss}
-    parents["td3"] = partial(TD3Loss, bounds=(-1.0, 1.0))
+    parents = {
+        "sac": partial(SACLoss, target_entropy=-2.0),
+        "td3": partial(TD3Loss, bounds=(-1.0, 1.0)),
+    }
     for name, parent in parents.items():
         testing.check_equals_at_zero(OFF_POLICY[name], parent, **off_policy(name))
 

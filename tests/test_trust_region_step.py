@@ -114,6 +114,16 @@ def test_the_step_is_the_natural_gradient():
     torch.testing.assert_close(actor_state(loss) - before, expected, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.parametrize("shrink", [0.8, 0.5, 0.3])
+def test_a_step_that_is_too_long_is_shortened_by_the_factor_asked_for(shrink):
+    """Far from the policy the divergence is more than its quadratic approximation."""
+    loss = TrustRegionLoss(*make_networks(), entropy_bonus=False)
+    data = loss.estimate_advantages(make_batch()).reshape(-1)
+    info = TrustRegionStep(loss, max_kl=5.0, shrink=shrink).step(data)
+    assert info["step_fraction"] == pytest.approx(shrink)
+    assert info["kl"] <= 5.0
+
+
 class ConstantDeviation(nn.Module):
     def forward(self, loc):
         return loc, torch.ones_like(loc)

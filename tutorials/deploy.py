@@ -176,10 +176,10 @@ print(f"{reached} targets reached, {touches} steps in contact")
 # A film
 # ------
 #
-# The same arm draws itself. These are six steps of one episode, from the same seed:
+# The same arm draws itself. These are six steps of the first of three episodes:
 
 robot = ArmGymEnv(render_mode="rgb_array")
-frames = []
+frames, ends = [], []
 for seed in range(3):
     observation, _ = robot.reset(seed=seed)
     done = False
@@ -187,11 +187,13 @@ for seed in range(3):
         observation, _, terminated, truncated, _ = robot.step(policy(observation))
         frames.append(Image.fromarray(robot.render()))
         done = terminated or truncated
+    ends.append(len(frames))
 robot.close()
 
 figure, axes = plt.subplots(1, 6, figsize=(12, 2))
-for axis, picture in zip(axes, frames[::2], strict=False):
-    axis.imshow(picture)
+chosen = np.linspace(0, ends[0] - 1, 6).round().astype(int)
+for axis, index in zip(axes, chosen, strict=True):
+    axis.imshow(frames[index])
     axis.set_axis_off()
 figure.tight_layout()
 

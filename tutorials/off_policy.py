@@ -14,8 +14,8 @@ seed to seed and from processor to processor than PPO does.
 # The environment
 # ---------------
 #
-# The same arm, obstacle and cost as before. SAC needs bounded actions, which all actions of
-# ``ArmEnv`` are.
+# A Panda, with an obstacle on its way and a cost for touching it. SAC needs bounded actions, which
+# those of ``ArmEnv`` are by default.
 
 import matplotlib.pyplot as plt
 import torch

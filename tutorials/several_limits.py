@@ -34,6 +34,7 @@ from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.objectives import PIDControl, PPOLagrangianLoss
 
 torch.set_num_threads(1)
+torch.manual_seed(0)
 torchrl_logger.setLevel("WARNING")
 
 CEILING = 0.23  # m
