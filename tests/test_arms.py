@@ -9,7 +9,7 @@ import pytest
 import torch
 from bullet_worlds import make_world, worlds_of
 from tensordict import TensorDict
-from worlds import ARMS, each_arm
+from worlds import ARMS, ENGINES, each_arm
 
 from torchrl_safe.envs import (
     IIWA,
@@ -270,6 +270,14 @@ def test_bad_mount_is_named(name):
 def test_arm_rejects(changes, error, message):
     with pytest.raises(error, match=message):
         dataclasses.replace(PANDA, **changes)
+
+
+@pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
+def test_free_fingers_begin_within_their_limits(physics):
+    arm = dataclasses.replace(PANDA, finger_home=0.5)
+    with pytest.raises(ValueError, match=r"finger_home must be within .*, got 0\.5"):
+        physics.build(arm, Scene(free_fingers=True), num_envs=1)
+    physics.build(arm, Scene(), num_envs=1).close()  # They are fixed.
 
 
 def test_tool_must_be_moved_by_a_joint():

@@ -109,6 +109,17 @@ def check_home(arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.floa
         )
 
 
+def check_finger_home(
+    arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> None:
+    """Raises ValueError unless free fingers begin within their limits, m, ``(f,)``."""
+    if not np.all((lower <= arm.finger_home) & (arm.finger_home <= upper)):
+        raise ValueError(
+            f"finger_home must be within the limits of the fingers, {lower.tolist()} and "
+            f"{upper.tolist()}, got {arm.finger_home}."
+        )
+
+
 # Turned by a quarter, a hand has its narrow side to what is beside the object. The direction of the
 # turn decides where the elbow of an arm with seven joints goes. The wrist of a UR hangs too low for
 # that, so its hand leans back instead.

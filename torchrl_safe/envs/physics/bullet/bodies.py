@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.arms.models import check_home
+from torchrl_safe.envs.arms.models import check_finger_home, check_home
 from torchrl_safe.envs.arms.urdf import prepare_urdf
 from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Part, Shape, Sphere
 from torchrl_safe.envs.physics.bullet.engine import pybullet, pybullet_data
@@ -48,6 +48,8 @@ class LoadedArm:
         num_movable: number of all movable joints.
         joint_lower: lower limits of the arm's joints, rad.
         joint_upper: upper limits of the arm's joints, rad.
+        finger_lower: lower limits of the fingers, m.
+        finger_upper: upper limits of the fingers, m.
         speed: largest speeds of joints and fingers, rad/s and m/s.
         effort: largest torques and forces of joints and fingers, N m and N.
     """
@@ -61,6 +63,8 @@ class LoadedArm:
     num_movable: int
     joint_lower: Array
     joint_upper: Array
+    finger_lower: Array
+    finger_upper: Array
     speed: Array
     effort: list[float]
 
@@ -99,6 +103,7 @@ def load_arm(
     loaded = _find_joints(client, body, chain, tool_link)
     check_home(arm, loaded.joint_lower, loaded.joint_upper)
     if scene.motor_limits:
+        check_finger_home(arm, loaded.finger_lower, loaded.finger_upper)
         _couple(client, body, loaded.fingers)
     return loaded
 
@@ -159,7 +164,9 @@ def _find_joints(client: int, body: int, chain: set[str], tool_link: str) -> Loa
     if not joints:
         raise ValueError(f"ee_link must be a link that a joint moves, got {tool_link!r}.")
     fingers = [info for info in movable if info[1].decode() not in chain]
-    unlimited = [info[8] >= info[9] for info in joints]
+    count, both = len(joints), joints + fingers
+    lower, upper = np.array([info[8:10] for info in both]).T
+    lower, upper = np.where(lower >= upper, [[-np.inf], [np.inf]], [lower, upper])
     return LoadedArm(
         body=body,
         ee=next(info[0] for info in infos if info[12].decode() == tool_link),
@@ -168,10 +175,12 @@ def _find_joints(client: int, body: int, chain: set[str], tool_link: str) -> Loa
         fingers=[info[0] for info in fingers],
         columns=[movable.index(info) for info in joints],
         num_movable=len(movable),
-        joint_lower=np.where(unlimited, -np.inf, [info[8] for info in joints]),
-        joint_upper=np.where(unlimited, np.inf, [info[9] for info in joints]),
-        speed=np.array([info[11] or np.inf for info in joints + fingers]),
-        effort=[info[10] or _UNLIMITED_EFFORT for info in joints + fingers],
+        joint_lower=lower[:count],
+        joint_upper=upper[:count],
+        finger_lower=lower[count:],
+        finger_upper=upper[count:],
+        speed=np.array([info[11] or np.inf for info in both]),
+        effort=[info[10] or _UNLIMITED_EFFORT for info in both],
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.arms.models import check_home
+from torchrl_safe.envs.arms.models import check_finger_home, check_home
 from torchrl_safe.envs.arms.urdf import prepare_urdf
 from torchrl_safe.envs.physics.mujoco.contacts import collides, set_arm_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
@@ -36,6 +36,8 @@ class ArmParts:
         fingers: names of the other movable joints.
         joint_lower: lower limits of the arm's joints, rad.
         joint_upper: upper limits of the arm's joints, rad.
+        finger_lower: lower limits of the fingers, m.
+        finger_upper: upper limits of the fingers, m.
         speed: largest speeds of joints and fingers, rad/s and m/s, infinite where none is given.
         effort: largest torques and forces of joints and fingers, N m and N; likewise.
     """
@@ -48,6 +50,8 @@ class ArmParts:
     fingers: tuple[str, ...]
     joint_lower: Array
     joint_upper: Array
+    finger_lower: Array
+    finger_upper: Array
     speed: Array
     effort: Array
 
@@ -83,6 +87,7 @@ def read_arm(
     check_home(arm, parts.joint_lower, parts.joint_upper)
     _free_joints(spec, parts)
     if couple:
+        check_finger_home(arm, parts.finger_lower, parts.finger_upper)
         _couple(spec, parts.fingers)
     else:
         for gear in list(spec.equalities):
@@ -133,6 +138,8 @@ def _find_parts(spec: Any, root: ElementTree.Element, chain: set[str], tool: str
         fingers=tuple(fingers),
         joint_lower=lower[:count],
         joint_upper=upper[:count],
+        finger_lower=lower[count:],
+        finger_upper=upper[count:],
         speed=speed,
         effort=effort,
     )
