@@ -246,7 +246,7 @@ def test_placement_fills_in():
         ({"position": [1, 2, 3]}, r"position must have shape \(3, 3\), got \(3,\)"),
         ({"position": [[1, 2, np.inf]]}, "position must be finite"),
         ({"position": [[1, 2, 3]], "orientation": [0, 0, 0, 1]}, r"orientation must have shape"),
-        ({"position": [[1, 2, 3]], "orientation": [[0, 0, 0, 0]]}, "orientation must be unit"),
+        ({"position": [[1, 2, 3]], "orientation": [[0, 0, 0, 0]]}, "orientation must be a unit"),
         ({"position": [[1, 2, 3]], "present": True}, r"present must have shape \(1,\), got \(\)"),
     ],
 )
