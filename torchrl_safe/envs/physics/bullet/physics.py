@@ -58,6 +58,7 @@ class Bullet:
             check_positive(motor_gain=self.motor_gain)
             if self.motor_gain > 1:
                 raise ValueError(f"motor_gain must be at most 1, got {self.motor_gain}.")
+        check_kind("furniture", self.furniture, Sequence)
         for each in self.furniture:
             if not isinstance(each, tuple) or len(each) != 2 or not isinstance(each[0], str):
                 raise TypeError(f"furniture must be pairs of a file and a position, got {each!r}.")
