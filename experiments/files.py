@@ -37,11 +37,13 @@ def run_to_resume(config: Any, changeable: Collection[str]) -> dict[str, Any] | 
 
     Raises:
         FileExistsError: if the folder has something in it, and no run that is to be resumed.
-        ValueError: if that run has other settings.
+        ValueError: if that run has other settings, such as those of another script.
     """
     path = config.out / "results.json"
+    before: dict[str, Any] = {}
     if config.resume and path.exists():
-        before: dict[str, Any] = json.loads(path.read_text())
+        before = json.loads(path.read_text())
+    if before and "runs" not in before:  # Those of a grid have several.
         was, now = (lasting(each, changeable) for each in (before["config"], as_json(config)))
         refuse_other_settings(was, now)
         return before

@@ -348,7 +348,7 @@ def play(
 
 
 def run(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
-    """One run of a grid, which shows its own progress."""
+    """One run of a grid; the grid shows the progress."""
     return train_and_evaluate(config, algorithm, progress=False)
 
 

@@ -14,7 +14,7 @@ seed to seed and from processor to processor than PPO does.
 # The environment
 # ---------------
 #
-# A Panda, with an obstacle on its way and a cost for touching it. SAC needs bounded actions, which
+# A Panda, with an obstacle in its way and a cost for touching it. SAC needs bounded actions, which
 # those of ``ArmEnv`` are by default.
 
 import matplotlib.pyplot as plt

@@ -74,8 +74,8 @@ class ArmEnv(EnvBase):
         observation (Callable, optional): maps the state to named fields, which are
             concatenated. Defaults to :class:`~torchrl_safe.envs.FullObservation`.
         frame_skip (int, optional): physics substeps of 1/240 s for each action. Defaults to
-            ``12``: a control rate of 20 Hz. With fewer than 6 the arm lags behind its actions:
-            with 1 it does two thirds of each.
+            ``12``: a control rate of 20 Hz. With fewer, MuJoCo's arm lags behind the first
+            actions after rest.
         max_episode_steps (int, optional): time limit; sets ``truncated``. Defaults to ``40``,
             2 s at 20 Hz.
         scene (Scene, optional): gravity, fingers and motors. Defaults to ``Scene()``.
@@ -357,8 +357,8 @@ class ArmEnv(EnvBase):
         """Brings the running episodes back, as part of ``load_state_dict``.
 
         Raises:
-            ValueError: if the state has another number of worlds, or of numbers in each; the
-                episodes go on then as they were.
+            ValueError: if the state has another number of worlds, or of numbers in each, or is of
+                another ``frame_skip`` or home pose; the episodes go on then as they were.
         """
         self._check_open()
         own = self.get_extra_state()

@@ -112,7 +112,10 @@ def check_home(arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.floa
 def check_finger_home(
     arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.float64]
 ) -> None:
-    """Raises ValueError unless free fingers begin within their limits, m, ``(f,)``."""
+    """Raises ValueError unless free fingers begin within their limits, m, ``(f,)``.
+
+    Not for motors without limits: the paper's arm begins beyond them.
+    """
     if not np.all((lower <= arm.finger_home) & (arm.finger_home <= upper)):
         raise ValueError(
             f"finger_home must be within the limits of the fingers, {lower.tolist()} and "

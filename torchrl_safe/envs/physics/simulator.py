@@ -101,8 +101,8 @@ class Simulator(Protocol):
         """Takes a control step of ``frame_skip`` substeps in all worlds.
 
         The motors' targets move evenly from where joints and fingers are to what is given, in
-        equal parts over the substeps. At the end of a control step of at least 6 substeps they have
-        arrived to within 6 % of the way, if efforts and speeds allow.
+        equal parts over the substeps. At the end of a control step of at least 12 substeps they
+        have arrived to within 5 % of the way, if efforts and speeds allow.
 
         Every substep reads the contacts of arm and obstacles, and what the sensing asks for:
         contact points are those on which the substep's forces acted; everything else is as it is

@@ -121,7 +121,7 @@ def _active_set(
         # Neither will ever happen: there is no solution.
         open_ &= np.isfinite(step) & ~singular
         step = np.where(open_, step, 0.0)
-        point = point + np.where(new, step, 0.0)[:, None] * free
+        point = point + np.where(length > _PARALLEL, step, 0.0)[:, None] * free
         multipliers -= np.where(held, step[:, None] * shares, 0.0)
         weight += step
         joins = np.flatnonzero(open_ & (full <= limits[each, last]))

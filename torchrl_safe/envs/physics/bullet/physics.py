@@ -60,7 +60,7 @@ class Bullet:
                 raise ValueError(f"motor_gain must be at most 1, got {self.motor_gain}.")
         check_kind("furniture", self.furniture, Sequence)
         for each in self.furniture:
-            if not isinstance(each, tuple) or len(each) != 2 or not isinstance(each[0], str):
+            if not isinstance(each, tuple | list) or len(each) != 2 or not isinstance(each[0], str):
                 raise TypeError(f"furniture must be pairs of a file and a position, got {each!r}.")
             check_array("position of furniture", each[1], (3,))
         if self.target_urdf is not None:
