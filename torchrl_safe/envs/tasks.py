@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_safe._checks import check_flag, check_kind, check_positive
-from torchrl_safe.envs.obstacles.shapes import Box, Shape
+from torchrl_safe.envs.obstacles.shapes import Box, Shape, check_shapes
 from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.state import ArmState, Array
 
@@ -179,7 +179,7 @@ class Push:
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
         check_flag(shaped=self.shaped, sparse=self.sparse)
-        _check_object(self.shape)
+        check_shapes("shape", (self.shape,), movable=True)
         _check_distance(self.distance, self.radius)
 
     @property
@@ -265,7 +265,7 @@ class PickAndPlace:
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
         check_flag(shaped=self.shaped, sparse=self.sparse)
-        _check_object(self.shape)
+        check_shapes("shape", (self.shape,), movable=True)
         deep, wide, _ = self.shape.half_extents
         if not math.isclose(deep, wide, rel_tol=0.01):
             raise ValueError(
@@ -324,12 +324,6 @@ def _check_distance(distance: float, radius: float) -> None:
     check_positive(distance=distance)
     if distance <= radius:
         raise ValueError(f"distance must be more than radius, {radius}, got {distance}.")
-
-
-def _check_object(shape: Shape) -> None:
-    check_kind("shape", shape, Shape)
-    if not shape.mass:
-        raise ValueError(f"shape must have a mass to be moved, got {shape}.")
 
 
 def _reward(distance: Array, radius: float, sparse: bool) -> Array:
