@@ -1,6 +1,6 @@
 """What costs measure, in the real simulator."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pybullet
@@ -43,12 +43,13 @@ EVERYTHING = {
 }
 
 
+@pytest.mark.parametrize("opening", [0.0, 0.03], ids=["closed", "open"])
 @each_arm
-def test_at_home_the_arm_touches_neither_table_nor_itself(make_env, arm):
+def test_at_home_the_arm_touches_neither_table_nor_itself(make_env, arm, opening):
     """Not even closely, nor when it opens and closes its fingers; what it stands on is no touch."""
     env = make_env(
         ArmEnv,
-        arm,
+        replace(arm, finger_home=opening),
         action=CartesianDelta(finger_step=0.04),
         obstacles=NoObstacles(),
         costs=EVERYTHING,
@@ -57,9 +58,9 @@ def test_at_home_the_arm_touches_neither_table_nor_itself(make_env, arm):
     )
     env.reset()
     trace = env.arm_state.trace
-    for opening in (1, -1):
+    for motion in (1, -1):
         for _ in range(10):
-            assert not step(env, [0, 0, 0, opening])["cost"].any()
+            assert not step(env, [0, 0, 0, motion])["cost"].any()
             assert (env.arm_state.trace["table_distance"] > 0.02).all()
     assert trace["table_distance"].shape == trace["self_distance"].shape == (1, 12)
 

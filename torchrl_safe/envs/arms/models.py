@@ -123,6 +123,17 @@ def check_finger_home(
         )
 
 
+def grips(
+    arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Positions of free fingers at their limits, m, ``(f,)``, and at the start, which is last.
+
+    Those without a limit are where they start.
+    """
+    home = np.full_like(lower, arm.finger_home)
+    return [*(np.where(np.isfinite(limit), limit, home) for limit in (lower, upper)), home]
+
+
 # Turned by a quarter, a hand has its narrow side to what is beside the object. The direction of the
 # turn decides where the elbow of an arm with seven joints goes. The wrist of a UR hangs too low for
 # that, so its hand leans back instead.

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.arms.models import grips
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.bullet.bodies import (
@@ -154,10 +155,10 @@ class World:
             pybullet.setPhysicsEngineParameter(solverResidualThreshold=0, physicsClientId=client)
         # Bullet restores a state bit for bit only if it was saved after a first step.
         pybullet.stepSimulation(physicsClientId=client)
-        fingers = [arm.finger_home] * len(self._arm.fingers)
-        self._set_joints([*arm.home, *fingers])
-        if sensing.itself:
-            self._allow_overlaps()
+        for fingers in grips(arm, self._arm.finger_lower, self._arm.finger_upper):
+            self._set_joints([*arm.home, *fingers])
+            if sensing.itself:
+                self._allow_overlaps()
         self._home = pybullet.saveState(physicsClientId=client)
         self._goal: Vector = limbo(0)
         self._present: list[int] = []
@@ -176,7 +177,7 @@ class World:
         self.joint_speed, self.finger_speed = self._arm.speed[:joints], self._arm.speed[joints:]
 
     def _allow_overlaps(self) -> None:
-        # The collision shapes of neighbouring links overlap, which is not the arm's doing.
+        # The collision shapes of neighbouring links overlap, and fingers touch where they close.
         body = self._arm.body
         pybullet.performCollisionDetection(physicsClientId=self._client)
         for point in pybullet.getContactPoints(body, body, physicsClientId=self._client):

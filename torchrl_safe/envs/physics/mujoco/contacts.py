@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import combinations
 from typing import Any
 
@@ -95,21 +95,22 @@ def _set(geom: Any, kind: int, others: int) -> None:
     geom.margin = 0.0
 
 
-def exclude_overlaps(spec: Any, arm: set[str], model: Any, data: Any) -> None:
-    """Excludes collisions of neighbouring links, and of links that touch each other at home.
+def exclude_overlaps(spec: Any, arm: set[str], model: Any, states: Iterable[Any]) -> None:
+    """Excludes collisions of neighbouring links, and of links that touch each other by design.
 
-    The collision shapes of neighbours overlap by design. MuJoCo does not test parents against
-    children, unless the parent does not move.
+    The collision shapes of neighbours overlap. MuJoCo does not test parents against children,
+    unless the parent does not move.
 
     Args:
         spec: the world; changed in place.
         arm: names of the arm's bodies.
         model: the world as it is, compiled.
-        data: its state at home, with contacts.
+        states: states of it, with contacts, in which links may touch.
     """
-    contacts = data.contact
-    touching = np.asarray(model.geom_bodyid)[contacts.geom[contacts.dist <= 0]]
-    pairs = {tuple(sorted(model.body(i).name for i in pair)) for pair in touching}
+    pairs = set()
+    for contacts in (data.contact for data in states):
+        touching = np.asarray(model.geom_bodyid)[contacts.geom[contacts.dist <= 0]]
+        pairs |= {tuple(sorted(model.body(i).name for i in pair)) for pair in touching}
     for body in arm:
         parent = model.body(model.body(body).parentid[0]).name
         pairs.add(tuple(sorted((body, parent))))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
+from torchrl_safe.envs.arms.models import grips
 from torchrl_safe.envs.obstacles.shapes import Cylinder, Shape
 from torchrl_safe.envs.physics.mujoco.arm import ArmParts, name_solids, read_arm
 from torchrl_safe.envs.physics.mujoco.bodies import (
@@ -78,8 +79,11 @@ def build_world(
     _add_bodies(spec, shapes, objects, reach=CONTACT_RANGE)
     add_motors(spec, parts, limited=scene.motor_limits, strength=scene.motor_strength)
     sensors = Sensors(spec, parts, solids, shapes, sensing)
-    model, data = _at_home(spec, arm, parts)
-    exclude_overlaps(spec, links, model, data)
+    model = spec.compile()
+    positions = grips(arm, parts.finger_lower, parts.finger_upper)
+    states = [_at_home(model, arm, parts, fingers) for fingers in positions]
+    exclude_overlaps(spec, links, model, states)
+    data = states[-1]
     exclude_unreachable(spec, links, model, data, reach=CONTACT_RANGE)
     ids = [model.joint(name).id for name in parts.joints + parts.fingers]
     velocity = model.jnt_dofadr[ids]
@@ -154,13 +158,10 @@ def _add_bodies(
         add_object(spec, index, shape)
 
 
-def _at_home(spec: Any, arm: ArmModel, parts: ArmParts) -> tuple[Any, Any]:
-    """The world compiled as it is, and its state with the arm at home and all else far away."""
-    model = spec.compile()
+def _at_home(model: Any, arm: ArmModel, parts: ArmParts, fingers: Array) -> Any:
+    """The state with the arm at home, and all else far away."""
     data = mujoco.MjData(model)
-    for name, angle in zip(parts.joints, arm.home, strict=True):
-        data.joint(name).qpos = angle
-    for name in parts.fingers:
-        data.joint(name).qpos = arm.finger_home
+    for name, position in zip(parts.joints + parts.fingers, (*arm.home, *fingers), strict=True):
+        data.joint(name).qpos = position
     mujoco.mj_forward(model, data)
-    return model, data
+    return data
