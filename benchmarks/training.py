@@ -1,8 +1,8 @@
 """Whole training, batch by batch, against Stable-Baselines3's PPO.
 
-Stable-Baselines3 has the Gymnasium view of the Bullet arm, PPO-Lagrangian that arm and MuJoCo's.
-Frames, minibatches, epochs and networks (two layers of 64) are the same; PPO-Lagrangian has three
-networks, Stable-Baselines3 two. All have one thread; what starting and compiling take is left out.
+Stable-Baselines3 has the Gymnasium view of the same arms. Frames, minibatches, epochs and networks
+(two layers of 64) are the same; PPO-Lagrangian has three networks, Stable-Baselines3 two. All have
+one thread; what starting and compiling take is left out.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.algorithms import ALGORITHMS
 from experiments.compiling import PAYS_FROM
 from experiments.config import AlgorithmName, Config
-from experiments.train import collecting, make_env
+from experiments.train import PHYSICS, collecting, make_env
 from torchrl_safe.envs import PAPER_JOINT, PAPER_SETTINGS, JointDelta
 from torchrl_safe.envs.gym import ArmGymEnv
 
@@ -56,8 +56,10 @@ def ours(config: Config) -> Iterator[Contender]:
 @contextmanager
 def stable_baselines(config: Config, envs: int) -> Iterator[Contender]:
     """Stable-Baselines3's PPO with as many frames, minibatches and epochs."""
-    paper = {**PAPER_SETTINGS, "action": _BOUNDED}
-    factory = partial(ArmGymEnv, **(paper if config.paper else {"action": JointDelta()}))
+    arm: dict[str, Any] = {"action": JointDelta(), "physics": PHYSICS[config.physics]}
+    if config.paper:
+        arm = {**PAPER_SETTINGS, "action": _BOUNDED}
+    factory = partial(ArmGymEnv, **arm)
     vector = DummyVecEnv([factory] * envs)
     model = PPO(
         "MlpPolicy",
@@ -81,11 +83,13 @@ def run(*, quick: bool) -> list[Figure]:
     torch.set_num_threads(1)
     rounds, worlds = (1, 2) if quick else (5, 32)
     settings: dict[str, Any] = {"frames_per_batch": 64, "minibatch": 32} if quick else {}
+    counts = {f"{worlds} environments": worlds, "1 environment": 1}
     figures: list[Figure] = []
     for case, paper in (("paper's setting, 1 substep", True), ("default, 12 substeps", False)):
         config = Config(action="joint", envs=worlds, workers=1, paper=paper, **settings)
-        many = f"SB3, {worlds} environments"
         mine = {"PPO-Lagrangian": config}
+        theirs = {f"SB3, {count}": (config, n) for count, n in counts.items()}
+        many = next(iter(theirs))
         bars: dict[tuple[str, str], float] = {("PPO-Lagrangian", many): 3} if paper else {}
         if not paper:
             mujoco = replace(config, physics="mujoco")
@@ -94,13 +98,14 @@ def run(*, quick: bool) -> list[Figure]:
                 # As a run of at least that length does it.
                 frames = PAYS_FROM * config.minibatch // config.epochs
                 mine["PPO-Lagrangian (MuJoCo), compiled"] = replace(mujoco, frames=frames)
+            theirs |= {f"SB3 (MuJoCo), {count}": (mujoco, n) for count, n in counts.items()}
             bars |= {(name, many): 4 for name in mine if "MuJoCo" in name}
         with ExitStack() as stack:
             contenders = {name: stack.enter_context(ours(c)) for name, c in mine.items()}
-            contenders[many] = stack.enter_context(stable_baselines(config, worlds))
-            contenders["SB3, 1 environment"] = stack.enter_context(stable_baselines(config, 1))
+            for name, (arm, envs) in theirs.items():
+                contenders[name] = stack.enter_context(stable_baselines(arm, envs))
             times = race(contenders, rounds=rounds)
-        for name, other in product(mine, (many, "SB3, 1 environment")):
+        for name, other in product(mine, theirs):
             title, bar = f"{case}: {name} / {other}", bars.get((name, other))
             figures.append(ratio(title, times[other], times[name], at_least=bar))
         for name, taken in times.items():
