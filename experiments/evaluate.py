@@ -152,7 +152,8 @@ def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
     costs, limits = num_costs(env), cost_limits(config, saved)
     if len(limits) != costs:
         raise ValueError(
-            f"cost_limits must be one for each of the {costs} costs of env, got {limits}."
+            f"cost_limits must be one for each of the {costs} costs of env, got {limits}: pass "
+            "--cost-limits."
         )
     if config.video is not None and not is_arm(env):
         raise ValueError(f"video films an ArmEnv, got {str(config.video)!r} with {env}.")

@@ -58,6 +58,15 @@ def train(loss, data, updates=20):
         optimizer.zero_grad()
 
 
+def shift(loss):
+    """Moves the policy, as the gradient steps of a phase do."""
+    noise = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for name, parameter in loss.named_parameters():
+            if name.startswith("actor_network"):
+                parameter.add_(0.1 * torch.randn(parameter.shape, generator=noise))
+
+
 def policy(loss, data):
     """The distribution that the loss's actor gives, with gradients to its parameters."""
     with loss.actor_network_params.to_module(loss.actor_network):

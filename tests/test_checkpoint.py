@@ -271,6 +271,12 @@ def test_steps_are_whole_numbers(run, step):
         run.save(step)
 
 
+def test_settings_that_are_nan_are_the_same(tmp_path, net):
+    settings = {"lr": float("nan")}
+    RunCheckpoints(tmp_path, {"net": net}, settings=settings).save(1)
+    assert RunCheckpoints(tmp_path, {"net": net}, settings=settings).load() == 1
+
+
 def test_settings_that_differ_are_named():
     same = {"lr": 0.1, "seed": 0, "old": 1}
     refuse_other_settings(same, dict(same))

@@ -342,6 +342,51 @@ def test_a_batch_without_advantages_is_treated_like_one_with_them(make, scale):
         assert torch.equal(losses[key], value), key
 
 
+@all_losses
+def test_single_steps_have_no_advantages_to_estimate(make):
+    """Those of shuffled steps would be wrong, and move the scale of the costs."""
+    loss = make(*make_networks(2), num_costs=2)
+    steps = make_batch(2).reshape(-1)[torch.randperm(24)]
+    before = copy.deepcopy(loss.state_dict())
+    with pytest.raises(ValueError, match=r"must have a dimension of time .* shape \(24,\)"):
+        loss(steps)
+    for key, value in loss.state_dict().items():
+        assert torch.equal(value, before[key]), key
+    trajectory = make_batch(2)[0]
+    assert trajectory.names == ["time"]
+    assert loss(trajectory)["loss_cost_critic"].isfinite()
+
+
+def test_the_variance_that_is_explained_is_that_of_the_steps_that_count():
+    loss = PPOLagrangianLoss(*make_networks(2), num_costs=2, clip_value=0.01)
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    data["cost_value"] += 0.02 * torch.randn(24, 2)  # As if the critic had moved since.
+    kept = torch.arange(24) % 3 != 0
+    expected = loss(data[kept])
+    data["cost_value_target"][~kept] = 1e3
+    losses = loss(data.set(("collector", "mask"), kept.unsqueeze(-1)))
+    for key in ("cost_explained_variance", "cost_value_clip_fraction"):
+        torch.testing.assert_close(losses[key], expected[key])
+    assert 0 < losses["cost_value_clip_fraction"] < 1
+
+
+def test_a_cost_critic_that_writes_another_key_is_named():
+    actor, critic, _ = make_networks()
+    loss = PPOLagrangianLoss(actor, critic, make_networks(seed=1)[1])
+    message = r"cost_critic_network must write 'cost_value', got one that writes \['state_value'\]"
+    with pytest.raises(ValueError, match=message):
+        loss.estimate_advantages(make_batch())
+    for wrong in (None, torch.nn.Linear(4, 1)):
+        with pytest.raises(TypeError, match="cost_critic_network must be an instance of"):
+            PPOLagrangianLoss(actor, critic, wrong)
+
+
+def test_what_was_chosen_when_it_was_made_stays():
+    loss = PPOLagrangianLoss(*make_networks(), normalize_cost_advantage=False)
+    with pytest.raises(AttributeError):
+        loss.normalize_cost_advantage = True
+
+
 def test_the_objective_does_not_depend_on_the_scale_of_rewards():
     """Without estimate_advantages it was 1000 times as large, and the cost had no effect."""
     loss = PPOLagrangianLoss(*make_networks(2), num_costs=2, multiplier_init=1.0)

@@ -19,7 +19,7 @@ from torchrl.envs import (
     TransformedEnv,
     default_info_dict_reader,
 )
-from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.envs.utils import ExplorationType, RandomPolicy, exploration_type
 from torchrl.objectives import LossModule
 
 from experiments.log import figures
@@ -129,6 +129,13 @@ def test_any_environment_with_a_cost():
         evaluate(env, still, 0, seed=0)
     with pytest.raises(ValueError, match=r"cost_names must be one for each of the 2 costs, got \("):
         summarize(episodes, ("one",))
+
+
+def test_an_environment_comes_first(make_env):
+    env = make_env(ArmEnv)
+    policy = RandomPolicy(env.action_spec)
+    with pytest.raises(TypeError, match=r"env must be an instance of EnvBase, got <.*RandomPolicy"):
+        evaluate(policy, env, 1, seed=0)
 
 
 def test_summary_of_hand_made_episodes():

@@ -13,6 +13,7 @@ from first_order import (
     crpo,
     old_policy,
     policy,
+    shift,
     step,
     total,
     train,
@@ -110,6 +111,32 @@ def test_the_worst_cost_above_the_tolerance_takes_the_place_of_the_reward():
         assert torch.equal(mixed, expected)
 
 
+def test_the_worst_of_costs_in_different_units_is_the_worst_by_their_sizes():
+    """The second is a fifth of its size above its limit, the first half of it."""
+    reward, cost = torch.tensor([[1.0]]), torch.tensor([[3.0, 4.0]])
+    violation, scale = torch.tensor([0.5, 200.0]), torch.tensor([1.0, 1000.0])
+    assert rectified_advantage(reward, cost, violation, 0.0).item() == -4.0
+    assert rectified_advantage(reward, cost, violation, 0.0, scale).item() == -3.0
+    # With a tolerance each, only the second is above.
+    tolerance = torch.tensor([0.75, 10.0])
+    assert rectified_advantage(reward, cost, violation, tolerance, scale).item() == -4.0
+    assert rectified_advantage(reward, cost, -violation, tolerance, scale).item() == 1.0
+    # A cost that never varies has no size.
+    assert rectified_advantage(reward, cost, violation, 0.0, torch.zeros(2)).item() == -4.0
+
+
+def test_crpo_lowers_the_cost_that_is_worst_by_its_size():
+    loss = build(crpo, 2)
+    step(loss, [0.5, 200.0])
+    loss.cost_advantage_scale.copy_(torch.tensor([1.0, 1000.0]))
+    data = make_batch(2).reshape(-1)
+    data["advantage"] = torch.randn(24, 1)
+    data["cost_advantage"] = torch.randn(24, 2)
+    data["value_target"], data["cost_value_target"] = torch.randn(24, 1), torch.randn(24, 2)
+    expected = parent_of("crpo")(data.clone().set("advantage", -data["cost_advantage"][:, :1]))
+    assert torch.equal(loss(data)["loss_objective"], expected["loss_objective"])
+
+
 def test_the_penalty_without_rescaling():
     reward, cost = torch.tensor([[1.0], [2.0]]), torch.tensor([[3.0, 1.0], [-2.0, 0.0]])
     multiplier = torch.tensor([1.0, 0.5])
@@ -204,7 +231,7 @@ def test_cup_projects_by_hand(functional):
     train(loss, data, 3)
     improved = copy.deepcopy(loss)
     loss.start_projection()
-    train(loss, data, 3)
+    shift(loss)
     losses = loss.projection_loss(data)
 
     def evaluate(some):
@@ -228,12 +255,25 @@ def test_cup_projects_by_hand(functional):
     assert all(name.startswith("actor_network") for name in reached)
 
 
+def test_cup_projects_after_the_start_of_a_projection_only():
+    """Of this batch: with the policy of an earlier one it would go back to that."""
+    loss = build(CUPLoss)
+    data = estimated(loss)
+    with pytest.raises(RuntimeError, match="Call start_projection before"):
+        loss.projection_loss(data)
+    loss.start_projection()
+    loss.projection_loss(data)
+    loss(data)
+    with pytest.raises(RuntimeError, match="Call start_projection before"):
+        loss.projection_loss(data)
+
+
 def test_cup_projection_leads_back_to_the_improved_policy():
     loss = build(CUPLoss, 2)
     data = estimated(loss, 2)
     loss.start_projection()
     assert loss.projection_loss(data)["kl"] == 0.0
-    train(loss, data, 10)
+    shift(loss)
     moved = loss.projection_loss(data)["kl"]
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
     for _ in range(100):  # Multiplier zero: nothing but the divergence is left to minimize.
@@ -266,6 +306,68 @@ def surrogate_by_hand(loss, data):
     ratio = (current.log_prob(data["action"]) - old.log_prob(data["action"])).exp().unsqueeze(-1)
     products = ratio * data["cost_advantage"], ratio.clamp(0.8, 1.2) * data["cost_advantage"]
     return torch.maximum(*products).mean(0)
+
+
+def behind(loss, data):
+    """Logarithms of the ratios to the delayed policy, and of that to the one that collected."""
+    with loss.target_actor_network_params.to_module(loss.actor_network):
+        delayed = loss.actor_network.get_dist(data.select("observation"))
+    log_prob = policy(loss, data).log_prob(data["action"])
+    past, old = delayed.log_prob(data["action"]), data["action_log_prob"]
+    return (log_prob - past).unsqueeze(-1), (past - old).unsqueeze(-1)
+
+
+@pytest.mark.parametrize("cap", [None, 1.05])
+def test_the_surrogate_of_a_delayed_policy_by_hand(cap):
+    """PPO clips the ratio to the delayed policy; the weight is that to the one that collected."""
+    loss = build(P3OLoss, 2, penalty_coeff=7.0, delay_actor=True, max_importance_ratio=cap)
+    SoftUpdate(loss, eps=0.5)
+    data = estimated(loss, 2)
+    step(loss, [4.0, 100.0])
+    shift(loss)
+    log_ratio, log_weight = behind(loss, data)
+    assert log_weight.abs().min() > 1e-3
+    if cap is not None:
+        capped = torch.minimum(log_weight, math.log(cap) - log_ratio.detach())
+        assert 0 < (capped < log_weight).sum() < len(data)
+        log_weight = capped
+    cost, ratio = data["cost_advantage"], log_ratio.exp()
+    product = torch.maximum(ratio * cost, ratio.clamp(0.8, 1.2) * cost) - cost
+    surrogate = (log_weight.exp() * product).mean(0)
+    expected = 7 * (surrogate + 0.01 * torch.tensor([4.0, 100.0])).clamp_min(0).sum()
+    penalty = loss(data)["loss_penalty"]
+    torch.testing.assert_close(penalty, expected)
+    torch.testing.assert_close(actor_gradient(loss, penalty), actor_gradient(loss, expected))
+
+
+def test_the_projection_of_a_delayed_policy_by_hand():
+    """Its ratio is the whole one, to the policy that collected."""
+    loss = build(CUPLoss, 1, multiplier_init=2.0, delay_actor=True)
+    SoftUpdate(loss, eps=0.5)
+    data = estimated(loss, 1)
+    loss.start_projection()
+    shift(loss)
+    log_ratio, log_weight = behind(loss, data)
+    losses = loss.projection_loss(data)
+    scale = (1 - 0.99 * 0.95) / (1 - 0.99)
+    cost = scale * 2 * (log_ratio + log_weight).exp() * data["cost_advantage"]
+    torch.testing.assert_close(losses["loss_projection"], losses["kl"] + cost.mean())
+
+
+def test_a_coefficient_for_each_cost():
+    """Each acts as it does alone."""
+    for make, name in ((P3OLoss, "penalty_coeff"), (IPOLoss, "sharpness")):
+        losses = []
+        for value in (torch.tensor([5.0, 20.0]), 5.0, 20.0):
+            loss = build(make, 2, **{name: value})
+            data = estimated(loss, 2)
+            step(loss, [2.0, 3.0])
+            losses.append(loss)
+        both, first, second = (
+            loss.penalty(torch.tensor([0.3, 0.4]), scale=0.01) for loss in losses
+        )
+        assert torch.equal(both, torch.stack([first[0], second[1]]))
+        assert losses[0](data)["loss_penalty"].isfinite()
 
 
 @pytest.mark.parametrize("gamma", [0.99, 0.5])
@@ -521,9 +623,10 @@ def test_a_masked_action_leaves_the_gradients_finite(make, distribution, width):
         actor(batch)
     phases = [loss]
     if make is CUPLoss:
-        loss.start_projection()
         phases.append(loss.projection_loss)
     for phase in phases:
+        if phase is not loss:
+            loss.start_projection()
         losses = phase(batch)
         sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())

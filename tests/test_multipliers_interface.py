@@ -108,6 +108,47 @@ def test_bad_arguments_are_named(name, value):
         DualAscent(make_module(0.0, 0.0), **arguments)
 
 
+def test_a_bound_that_is_set_later_is_checked():
+    rule = DualAscent(make_module(0.0), cost_limit=1.0, lr=0.1)
+    for value in (-1.0, 0.0, NAN):
+        with pytest.raises(ValueError, match="max_multiplier must be positive"):
+            rule.max_multiplier = value
+    assert rule.max_multiplier is None
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "message"),
+    [
+        ("parametrization", "softplus", r"must be an instance of Transform, got 'softplus'"),
+        ("optimizer", "adam", r"must be a class such as torch.optim.Adam, got adam"),
+    ],
+)
+def test_what_dual_ascent_is_made_of_is_checked(argument, value, message):
+    with pytest.raises(TypeError, match=f"{argument} {message}"):
+        DualAscent(make_module(0.0), cost_limit=1.0, lr=0.1, **{argument: value})
+
+
+def test_a_multiplier_in_half_precision_is_refused():
+    """100 steps of 0.001 would leave it where it was."""
+    loss = make_module(1.0).to(torch.bfloat16)
+    rule = DualAscent(loss, cost_limit=0.0, lr=1e-3)
+    with pytest.raises(TypeError, match=r"lagrange_multiplier must be float32 .* torch.bfloat16"):
+        rule.step(torch.ones(1, 1))
+
+
+@pytest.mark.parametrize("value", [None, 0.5, [0.5]])
+def test_a_rule_that_returns_no_tensor_changes_nothing(value):
+    class Forgetful(MultiplierUpdater):
+        def next_multiplier(self, multiplier, violation):
+            multiplier += 0.1
+            return value
+
+    loss = make_module(1.0)
+    with pytest.raises(TypeError, match=r"must return a tensor of shape \(1,\), got"):
+        Forgetful(loss, cost_limit=0.0).step(torch.ones(1, 1))
+    assert loss.lagrange_multiplier.item() == 1.0
+
+
 NAMED = {"collision": 0.5, "speed": 2.0}
 
 

@@ -39,6 +39,7 @@ from experiments import evaluate
 from experiments.agent import Affine
 from experiments.config import Config
 from experiments.train import train
+from torchrl_safe import testing
 from torchrl_safe.envs import ArmEnv
 from torchrl_safe.evaluation import evaluate as play
 from torchrl_safe.policy import load_policy, save_policy
@@ -456,6 +457,14 @@ def test_what_cannot_be_saved(make, changed, error, message, tmp_path):
         save_policy(path, make(), **{"observation_spec": SPEC, **changed})
     assert list(tmp_path.iterdir()) == [path]
     assert path.read_bytes() == b"before"
+
+
+def test_the_actor_of_a_file_is_not_saved_again(policy, trained, tmp_path):
+    with pytest.raises(ValueError, match="actor comes from load_policy: copy its file instead"):
+        save_policy(tmp_path / "again.pt", policy.actor, Unbounded(40))
+    with pytest.raises(TypeError, match=r"observation_spec must be a TensorSpec, .* got Policy"):
+        save_policy(tmp_path / "again.pt", testing.make_actor(), policy)
+    assert not (tmp_path / "again.pt").exists()
 
 
 def test_an_observation_without_bounds(tmp_path):

@@ -76,6 +76,7 @@ ON_POLICY_CHECKS = (
     testing.check_num_costs,
     testing.check_masked_steps,
     testing.check_keys,
+    partial(testing.check_keys, nested=False, make_data=testing.make_batch),
     testing.check_dispatch,
     testing.check_input_unchanged,
     testing.check_state_dict,
@@ -85,6 +86,7 @@ ON_POLICY_CHECKS = (
 
 OFF_POLICY_CHECKS = (
     testing.check_gradients,
+    testing.check_q_multiplier_direction,
     testing.check_masked_steps,
     partial(testing.check_keys, names=testing.OFF_POLICY_KEYS),
     testing.check_dispatch,
@@ -371,6 +373,51 @@ def test_a_key_that_cannot_be_renamed():
         testing.check_keys(FixedKey)
     with pytest.raises(ValueError, match="not an accepted"):
         testing.check_keys(PPOLagrangianLoss, ["no_such_key"])
+
+
+class FixedCost(PPOLagrangianLoss):
+    """Estimates from ``cost``, whatever it is called."""
+
+    def _cost_estimator_keys(self):
+        return {**super()._cost_estimator_keys(), "reward": "cost"}
+
+
+def test_a_key_of_the_estimator_that_cannot_be_renamed():
+    """A loss that gets advantages never reads it."""
+    testing.check_keys(FixedCost)
+    with pytest.raises(KeyError, match=r"\('next', 'cost'\) was not found"):
+        testing.check_loss(FixedCost)
+
+
+class Unannounced(PPOLagrangianLoss):
+    """Has a loss that a call with keywords does not return."""
+
+    def policy_losses(self, *arguments):
+        losses = super().policy_losses(*arguments)
+        return losses.set("loss_hidden", losses["loss_objective"])
+
+
+def test_a_loss_that_is_not_announced():
+    with pytest.raises(AssertionError, match=r"out_keys lacks the output \['loss_hidden'\]"):
+        testing.check_dispatch(Unannounced)
+
+
+class WrongCritic(SACLagrangianLoss):
+    """Rewards costs, or lets each multiplier act on another one."""
+
+    def __init__(self, *networks, change, **options):
+        super().__init__(*networks, **options)
+        self.change = change
+
+    def _cost_qvalue(self, tensordict, params):
+        return self.change(super()._cost_qvalue(tensordict, params))
+
+
+@pytest.mark.parametrize("change", [torch.neg, lambda cost: cost.flip(-1)], ids=["sign", "column"])
+def test_a_multiplier_that_does_not_push_the_costs_of_actions_down(change):
+    make = partial(WrongCritic, target_entropy=-2.0, change=change)
+    with pytest.raises(AssertionError, match="with multiplier 100 for cost 0 a step must lower"):
+        testing.check_q_multiplier_direction(make)
 
 
 class Announces(PPOLagrangianLoss):

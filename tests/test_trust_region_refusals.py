@@ -29,6 +29,7 @@ from trust_region import (
 from torchrl_safe.objectives import (
     CPO,
     PCPO,
+    TRPO,
     DualAscent,
     FOCOPSLoss,
     TrustRegionLoss,
@@ -248,6 +249,21 @@ def test_a_critic_that_the_step_would_move_is_refused(kind, separate, functional
 def test_numbers_out_of_range_are_named(name, value):
     with pytest.raises(ValueError, match=rf"{name}.*{value}"):
         TrustRegionStep(make_loss(), **{name: value})
+
+
+def test_what_is_set_later_is_checked():
+    step = TrustRegionStep(make_loss())
+    for name, value in (("max_kl", -1.0), ("episode_length", -3.0)):
+        with pytest.raises(ValueError, match=rf"{name}.*{value}"):
+            setattr(step, name, value)
+    with pytest.raises(ValueError, match="episode_length"):
+        step.load_state_dict({**step.state_dict(), "episode_length": -4.0})
+
+
+@pytest.mark.parametrize("method", [CPO, TRPO, None, "cpo"])
+def test_a_method_is_an_object(method):
+    with pytest.raises(TypeError, match="method must be an instance of TrustRegionMethod"):
+        TrustRegionStep(make_loss(), method)
 
 
 def test_a_policy_without_a_divergence_in_closed_form_is_refused():

@@ -48,7 +48,7 @@ def check_count(*, least: int = 1, **values: Any) -> None:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
 
 
-def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
+def check_kind(name: str, value: Any, kind: type | UnionType, *, such_as: str = "") -> None:
     """Raises TypeError unless the value is an object of a class or protocol, not a class."""
     if isinstance(value, type) or not isinstance(value, kind):
         kinds = get_args(kind) or (kind,)
@@ -58,7 +58,8 @@ def check_kind(name: str, value: Any, kind: type | UnionType) -> None:
             members = [member for member in dir(kinds[0]) if not member.startswith("_")]
             missing = [member for member in members if not hasattr(value, member)]
             lacks = f", which has no {' and no '.join(missing)}" if missing else ""
-        raise TypeError(f"{name} must be an instance of {names}, got {value!r}{lacks}.")
+        hint = f" Pass for example {such_as}." if such_as else ""
+        raise TypeError(f"{name} must be an instance of {names}, got {value!r}{lacks}.{hint}")
 
 
 def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

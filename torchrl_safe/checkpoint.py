@@ -231,6 +231,5 @@ def refuse_other_settings(saved: Mapping[str, Any], settings: Mapping[str, Any])
 
 
 def _differs(one: Any, other: Any) -> bool:
-    """Also by the order of entries: costs, for example, are columns."""
-    both = isinstance(one, Mapping) and isinstance(other, Mapping)
-    return one != other or (both and list(one) != list(other))
+    """Also by the order of entries: costs, for example, are columns. NaN is like NaN."""
+    return json.dumps(one) != json.dumps(other)

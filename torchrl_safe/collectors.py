@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any
@@ -83,6 +84,13 @@ class ResumableCollector(Collector):
         for n, level in enumerate(around):
             if f"inner_env_{n}" in state_dict:
                 level.load_state_dict(state_dict[f"inner_env_{n}"])
+        if "torch_generator" in state_dict and "carrier" not in state_dict:
+            warnings.warn(
+                "Episodes begin anew, so the run differs from one that was not stopped: the state "
+                "of the environment was not saved. It needs get_extra_state, no ParallelEnv and no "
+                "trajs_per_batch.",
+                stacklevel=2,
+            )
         if "carrier" in state_dict:
             env.load_state_dict(state_dict["base_env_state_dict"])
             if "traj_pool" in state_dict:  # The pool of workers is in the state of their parent.

@@ -15,7 +15,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_safe._checks import check_count
+from torchrl_safe._checks import check_count, check_kind
 from torchrl_safe.metrics import mean, share, violation_rate
 
 __all__ = ["evaluate", "summarize"]
@@ -56,6 +56,7 @@ def evaluate(
         or ``episode_cost`` (:class:`~torchrl.envs.RewardSum`).
 
     Raises:
+        TypeError: if ``env`` is no environment.
         ValueError: if the environment has no cost or no reward, or an episode has not ended after
             ``max_steps``.
 
@@ -70,6 +71,7 @@ def evaluate(
         >>> list(figures)
         ['success', 'return', 'steps', 'cost/collision', 'any/collision']
     """
+    check_kind("env", env, EnvBase)
     check_count(episodes=episodes, max_steps=max_steps)
     specs = {**env.full_observation_spec, **env.full_reward_spec}
     for name in ("reward", "cost"):

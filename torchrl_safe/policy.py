@@ -168,10 +168,11 @@ def save_policy(
             numbers, strings, and lists and dicts of them. Defaults to nothing.
 
     Raises:
-        ValueError: if the actor cannot be saved. Either it reads several keys (a recurrent actor
-            reads its state) or writes no action. Or it cannot be copied, called or recorded;
-            Python code in it must not decide by the values of a tensor, as that of
-            :class:`~torchrl.modules.TruncatedNormal` does.
+        TypeError: if ``actor`` or ``observation_spec`` is not of its kind.
+        ValueError: if the actor cannot be saved. Either :func:`load_policy` made it; copy the file
+            instead. Or it reads several keys (a recurrent actor reads its state) or writes no
+            action. Or it cannot be copied, called or recorded; Python code in it must not decide
+            by the values of a tensor, as that of :class:`~torchrl.modules.TruncatedNormal` does.
 
     Examples:
         >>> import tempfile
@@ -189,6 +190,13 @@ def save_policy(
     """
     path = Path(path)
     observation_key = _observation_key(actor)
+    if isinstance(getattr(actor, "module", None), _AnyBatch):
+        raise ValueError("actor comes from load_policy: copy its file instead.")
+    if not isinstance(observation_spec, TensorSpec):
+        raise TypeError(
+            "observation_spec must be a TensorSpec, such as env.observation_spec_unbatched, got "
+            f"{type(observation_spec).__name__}."
+        )
     action_key = unravel_key(action_key)
     if action_key not in actor.out_keys:
         raise ValueError(

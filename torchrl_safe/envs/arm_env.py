@@ -129,16 +129,16 @@ class ArmEnv(EnvBase):
         gui: bool = False,
     ) -> None:
         check_count(num_envs=num_envs, frame_skip=frame_skip, max_episode_steps=max_episode_steps)
-        check_kind("arm", arm, ArmModel)
-        check_kind("action", action, ActionMode)
-        check_kind("task", task, Task)
-        check_kind("obstacles", obstacles, Obstacles)
-        check_kind("scene", scene, Scene)
-        check_kind("physics", physics, Physics)
+        check_kind("arm", arm, ArmModel, such_as="PANDA")
+        check_kind("action", action, ActionMode, such_as="JointDelta()")
+        check_kind("task", task, Task, such_as="Reach()")
+        check_kind("obstacles", obstacles, Obstacles, such_as="InFront()")
+        check_kind("scene", scene, Scene, such_as="Scene()")
+        check_kind("physics", physics, Physics, such_as="MuJoCo()")
         if shield is not None:
-            check_kind("shield", shield, Shield)
+            check_kind("shield", shield, Shield, such_as="Shield()")
         costs = {"collision": Collision()} if costs is None else costs
-        check_kind("costs", costs, Mapping)
+        check_kind("costs", costs, Mapping, such_as='{"collision": Collision()}')
         if not costs:
             raise ValueError("costs must name at least one cost, got an empty mapping.")
         if wrong := [name for name in costs if not isinstance(name, str)]:
@@ -146,7 +146,8 @@ class ArmEnv(EnvBase):
         named = [(f"cost {name!r}", cost) for name, cost in costs.items()]
         for name, function in [*named, ("observation", observation)]:
             if isinstance(function, type) or not callable(function):
-                raise TypeError(f"{name} must be a callable object, got {function!r}.")
+                kind = ", a class and not an object" if isinstance(function, type) else ""
+                raise TypeError(f"{name} must be a callable object, got {function!r}{kind}.")
         check_bound(action.bound)
         check_shapes("shapes of obstacles", obstacles.shapes)
         check_shapes("objects of task", task.objects, movable=True)

@@ -1,5 +1,6 @@
 """Constrained losses and the rules that move their multipliers. Needs TorchRL only."""
 
+from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.critics.cost_gae import CostGAE
 from torchrl_safe.objectives.critics.cost_td0 import CostTD0
 from torchrl_safe.objectives.functional import (
@@ -56,5 +57,6 @@ __all__ = [
     "ViolationUpdater",
     "cost_advantage_scale",
     "penalized_advantage",
+    "reduced",
     "scaled_advantages",
 ]

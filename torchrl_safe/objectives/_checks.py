@@ -38,6 +38,14 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
     return number
 
 
+def coefficients(name: str, value: Any, num_costs: int, *, positive: bool = False) -> Tensor:
+    """One number, shape ``()``, or one for each cost, ``(k,)``; see :func:`check_number`."""
+    if not isinstance(value, Tensor) or not value.ndim:
+        return torch.tensor(check_number(name, value, positive=positive))
+    check_one_each(name, value, num_costs)
+    return torch.tensor([check_number(name, each, positive=positive) for each in value])
+
+
 def check_share(name: str, value: Any) -> float:
     """Returns the value; raises ValueError unless it is a number from 0 to 1."""
     number = as_number(value)

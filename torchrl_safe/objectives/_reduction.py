@@ -24,7 +24,9 @@ def counted(loss: LossModule, tensordict: TensorDictBase, values: Tensor) -> Ten
 def reduced(
     loss: LossModule, values: Tensor, tensordict: TensorDictBase, reduction: str | None = None
 ) -> Tensor:
-    """The values as the loss reduces its own, over the steps that count.
+    """Reduces values as a loss reduces its own, over the steps that count.
+
+    Use it in a loss of your own: ``values.mean()`` would count the steps that a mask leaves out.
 
     Args:
         loss (LossModule): gives ``loss_mask_key`` and ``reduction``.
@@ -34,16 +36,39 @@ def reduced(
 
     Returns:
         A number, or with ``"none"`` the values, 0 where they do not count.
+
+    Raises:
+        ValueError: if a mask is not bool or does not fit the values.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> from torchrl_safe.testing import make_networks
+        >>> loss = PPOLagrangianLoss(*make_networks())
+        >>> mask = torch.tensor([[True], [True], [False]])
+        >>> data = TensorDict({("collector", "mask"): mask}, batch_size=[3])
+        >>> reduced(loss, torch.tensor([[1.0], [2.0], [60.0]]), data)
+        tensor(1.5000)
     """
     reduction = loss.reduction if reduction is None else reduction
     mask = counted(loss, tensordict, values)
-    if mask is not None:  # Not multiplied by the mask: a masked value may be NaN.
+    if mask is not None:  # Not multiplied by the mask: infinity times 0 is NaN.
         values = torch.where(mask, values, torch.zeros_like(values))
     if reduction == "none":
         return values
     if reduction == "sum":
         return values.sum()
     return values.mean() if mask is None else values.sum() / mask.sum().clamp_min(1)
+
+
+def variances(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Variance of each of k columns over the steps that count, shape ``(k,)``."""
+    if mask is None:
+        return values.flatten(0, -2).var(0, correction=0)
+    values, mask = values.flatten(0, -2), mask.flatten(0, -2)
+    count = mask.sum(0).clamp_min(1)
+    mean = torch.where(mask, values, 0.0).sum(0) / count
+    return torch.where(mask, (values - mean).square(), 0.0).sum(0) / count
 
 
 def expanded_mask(mask: Tensor, values: Tensor) -> Tensor:

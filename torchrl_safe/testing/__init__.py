@@ -21,6 +21,7 @@ from torchrl_safe.testing.gradients import (
     check_masked_steps,
     check_multiplier_direction,
     check_num_costs,
+    check_q_multiplier_direction,
 )
 from torchrl_safe.testing.interface import (
     OFF_POLICY_KEYS,
@@ -65,6 +66,7 @@ __all__ = [
     "check_multiplier_updater",
     "check_num_costs",
     "check_q_loss",
+    "check_q_multiplier_direction",
     "check_reaches_optimum",
     "check_state_dict",
     "make_actor",

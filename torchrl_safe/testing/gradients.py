@@ -6,7 +6,9 @@ from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ValueOperator
 from torchrl.objectives import LossModule
 
 from torchrl_safe.testing._losses import (
@@ -16,6 +18,7 @@ from torchrl_safe.testing._losses import (
     MakeNetworks,
     call,
     constrained,
+    finish,
     loss_keys,
     named,
     require,
@@ -24,8 +27,8 @@ from torchrl_safe.testing._losses import (
     set_multiplier,
     total,
 )
-from torchrl_safe.testing.batches import make_minibatch
-from torchrl_safe.testing.networks import make_networks as make_default_networks
+from torchrl_safe.testing.batches import make_minibatch, make_transitions
+from torchrl_safe.testing.networks import make_networks as make_default_networks, make_q_networks
 
 
 def check_gradients(
@@ -247,8 +250,7 @@ def check_multiplier_direction(
         0
     )
     for index in range(num_costs):
-        parts = torch.autograd.grad(surrogate[index], [*actor.parameters()], retain_graph=True)
-        uphill = torch.cat([part.flatten() for part in parts])
+        uphill = _gradient(surrogate[index], [*actor.parameters()])
         cosines = []
         for size in (0.0, 100.0):
             strength = torch.zeros(num_costs)
@@ -263,6 +265,76 @@ def check_multiplier_direction(
         )
 
 
+def check_q_multiplier_direction(
+    make_loss: MakeLoss,
+    *,
+    num_costs: int = 2,
+    make_networks: MakeNetworks = make_q_networks,
+    make_data: MakeData = make_transitions,
+    constrain: Constrain = set_multiplier,
+) -> None:
+    """Checks that each multiplier moves the policy of an off-policy loss towards less of its cost.
+
+    The critic of the costs predicts one component of the action for each cost. A step against the
+    gradient of a loss with a large multiplier must lower the mean of that component, and of no
+    other component as much.
+
+    Args:
+        make_loss (callable): makes the loss, called as ``make_loss(actor, qvalue, cost_qvalue,
+            num_costs=k)``.
+
+    Keyword Args:
+        num_costs (int, optional): number k of costs, at most as many as the action has numbers.
+        make_networks (callable, optional): see :func:`check_equals_at_zero`.
+        make_data (callable, optional): see :func:`check_equals_at_zero`.
+        constrain (callable, optional): see :func:`check_equals_at_zero`.
+
+    Raises:
+        AssertionError: if a multiplier pushes the wrong way, or acts through another column.
+
+    Examples:
+        >>> from functools import partial
+        >>> from torchrl_safe.objectives import SACLagrangianLoss
+        >>> check_q_multiplier_direction(partial(SACLagrangianLoss, target_entropy=-2.0))
+    """
+    actor, critic, _ = make_networks(num_costs, seed=0, keys={})
+    cost_critic = ValueOperator(
+        _Components(num_costs), ["observation", "action"], ["state_action_cost_value"]
+    )
+    loss = finish(lambda: make_loss(actor, critic, cost_critic, num_costs=num_costs), 0)
+    data, parameters = make_data(num_costs), list(actor.parameters())
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        action = call(actor, data)["action"].mean(0)
+    uphill = [_gradient(action[index], parameters) for index in range(num_costs)]
+    for index in range(num_costs):
+        strength = torch.zeros(num_costs)
+        strength[index] = 100.0
+        constrain(loss, strength)
+        downhill = _gradient(total(call(loss, data)), parameters)
+        cosines = [torch.cosine_similarity(downhill, each, dim=0).item() for each in uphill]
+        require(
+            cosines[index] > 0 and cosines[index] == max(cosines),
+            f"{named(loss)}: with multiplier 100 for cost {index} a step must lower this cost; the "
+            f"cosines of the loss's gradient and that of each cost are {cosines}",
+        )
+
+
+class _Components(nn.Module):
+    """A critic that takes one component of the action for the value of each cost."""
+
+    def __init__(self, num_costs: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(num_costs))
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        return self.weight * action[..., : len(self.weight)]
+
+
+def _gradient(value: Tensor, parameters: list[nn.Parameter]) -> Tensor:
+    parts = torch.autograd.grad(value, parameters, retain_graph=True)
+    return torch.cat([part.flatten() for part in parts])
+
+
 def _policy_gradient(
     make_loss: MakeLoss,
     make_networks: MakeNetworks,
@@ -275,6 +347,4 @@ def _policy_gradient(
     networks = make_networks(num_costs, seed=0, keys={})
     loss = make_loss(*networks, num_costs=num_costs)
     constrain(loss, strength)
-    parameters = list(networks[0].parameters())
-    gradients = torch.autograd.grad(total(call(loss, data)), parameters)
-    return loss, torch.cat([gradient.flatten() for gradient in gradients])
+    return loss, _gradient(total(call(loss, data)), [*networks[0].parameters()])

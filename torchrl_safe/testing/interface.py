@@ -64,6 +64,7 @@ def check_keys(
     make_loss: MakeLoss,
     names: Sequence[str] = ON_POLICY_KEYS,
     *,
+    nested: bool = True,
     num_costs: int = 2,
     make_networks: MakeNetworks = make_default_networks,
     make_data: MakeData = make_minibatch,
@@ -71,12 +72,17 @@ def check_keys(
 ) -> None:
     """Checks that keys can be renamed and nested, one by one and all at once.
 
+    To check what reads ``reward``, ``cost``, ``done`` and ``terminated`` of an on-policy loss, pass
+    ``make_data=make_batch, nested=False``: data that have advantages already need none of them.
+
     Args:
         make_loss (callable): see :func:`check_equals_at_zero`.
         names (sequence of str, optional): which keys, as ``set_keys`` takes them. Defaults to
             ``ON_POLICY_KEYS``; ``OFF_POLICY_KEYS`` has those of Q-losses.
 
     Keyword Args:
+        nested (bool, optional): nest the keys too. Estimators of TorchRL cannot read keys that are
+            nested under ``"next"`` alone. Defaults to ``True``.
         num_costs (int, optional): number k of costs.
         make_networks (callable, optional): see :func:`check_equals_at_zero`.
         make_data (callable, optional): see :func:`check_equals_at_zero`.
@@ -110,10 +116,10 @@ def check_keys(
 
     expected = run({})
     for name in names:
-        for key in ("renamed", ("nested", "renamed")):
+        for key in ("renamed", ("nested", "renamed"))[: 1 + nested]:
             what = f"with set_keys({name}={key!r})"
             require_same_outputs(what, run({name: key}), expected)
-    every = {name: ("nested", "deeper", name) for name in names}
+    every = {name: ("nested", "deeper", name) if nested else f"{name}_2" for name in names}
     require_same_outputs(f"with set_keys(**{every})", run(every), expected)
 
 
@@ -127,7 +133,8 @@ def check_dispatch(
 ) -> None:
     """Checks that a call with keyword arguments returns what a call with a tensordict does.
 
-    Also that every announced output is there, and that ``select_out_keys`` selects.
+    Also that ``out_keys`` has every ``loss_*`` output and no other than there are, and that
+    ``select_out_keys`` selects.
 
     Args:
         make_loss (callable): see :func:`check_equals_at_zero`.
@@ -155,6 +162,8 @@ def check_dispatch(
     expected = call(loss, data.select(*keys))
     missing = set(loss.out_keys) - set(expected.keys())
     require(not missing, f"{named(loss)}: out_keys has {sorted(missing)}, which is no output")
+    silent = set(loss_keys(expected)) - set(loss.out_keys)
+    require(not silent, f"{named(loss)}: out_keys lacks the output {sorted(silent)}")
     for key, output in zip(loss.out_keys, call(make(), **keywords), strict=True):
         require_close(f"{named(loss)}: output {key!r} of keywords", output, expected[key])
     chosen, loss = loss.out_keys[-2:], make()

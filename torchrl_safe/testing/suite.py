@@ -6,13 +6,14 @@ from functools import partial
 from typing import Any
 
 from torchrl_safe.testing._losses import Constrain, MakeLoss, set_multiplier
-from torchrl_safe.testing.batches import make_transitions
+from torchrl_safe.testing.batches import make_batch, make_transitions
 from torchrl_safe.testing.equality import check_equals_at_zero
 from torchrl_safe.testing.gradients import (
     check_gradients,
     check_masked_steps,
     check_multiplier_direction,
     check_num_costs,
+    check_q_multiplier_direction,
 )
 from torchrl_safe.testing.interface import (
     OFF_POLICY_KEYS,
@@ -68,6 +69,7 @@ def check_loss(
         check_compile,
     ):
         check(make_loss, constrain=constrain)
+    check_keys(make_loss, nested=False, make_data=make_batch, constrain=constrain)
 
 
 def check_q_loss(
@@ -112,6 +114,7 @@ def check_q_loss(
     check_input_unchanged(make_loss, writes=["td_error"], **setting)
     for check in (
         check_gradients,
+        check_q_multiplier_direction,
         check_masked_steps,
         check_dispatch,
         check_state_dict,

@@ -21,9 +21,9 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_safe._checks import check_count
+from torchrl_safe._checks import check_count, check_kind
 from torchrl_safe.objectives._checks import check_number, get_or_raise
-from torchrl_safe.objectives._reduction import counted, expanded_mask, reduced
+from torchrl_safe.objectives._reduction import counted, expanded_mask, reduced, variances
 from torchrl_safe.objectives.critics.cost_gae import CostGAE
 from torchrl_safe.objectives.critics.cost_values import CostValues
 from torchrl_safe.objectives.functional import scaled_advantages
@@ -68,6 +68,7 @@ class CostCritic(CostValues):
     ) -> None:
         check_count(num_costs=num_costs)
         cost_critic_coeff = check_number("cost_critic_coeff", cost_critic_coeff)
+        check_kind("cost_critic_network", cost_critic_network, TensorDictModuleBase)
         # The parent's constructor already sets keys, before a module can be assigned.
         self._cost_critic_in_keys = list(cost_critic_network.in_keys)
         self._shared_keys: list[NestedKey] = []
@@ -117,7 +118,7 @@ class CostCritic(CostValues):
         ``("collector", "mask")``, also end it.
 
         Call it on the batch as it was collected. A call of the loss with data without advantages
-        does the same first, which is wrong, without an error, for a minibatch of shuffled steps.
+        does the same first, and refuses a minibatch of single steps.
 
         Args:
             tensordict (TensorDictBase): a batch as collectors return it, shape ``(*B, T)``.
@@ -128,6 +129,8 @@ class CostCritic(CostValues):
 
         Raises:
             KeyError: if the batch has no cost.
+            ValueError: if the cost critic does not write ``cost_value``, or ``num_costs`` is not
+                the width of the cost.
         """
         with set_recurrent_mode(True):  # As TorchRL has it around a loss.
             self._estimate_advantages(tensordict)
@@ -141,6 +144,12 @@ class CostCritic(CostValues):
             raise ValueError("critic_network must be given to estimate advantages, got None.")
         cost_key = unravel_key(("next", keys.cost))
         self._check_width(cost_key, get_or_raise(tensordict, cost_key))
+        written = [unravel_key(key) for key in self.cost_critic_network.out_keys]
+        if unravel_key(keys.cost_value) not in written:
+            raise ValueError(
+                f"cost_critic_network must write {keys.cost_value!r}, got one that writes "
+                f"{written}: choose its out_keys, or call loss.set_keys(cost_value=...)."
+            )
         data = self._with_ends(self._with_features(tensordict))
         self.value_estimator(
             data,
@@ -265,7 +274,8 @@ class CostCritic(CostValues):
         if old_value is not None:
             moved = value - old_value
             clipped = moved.clamp(-self.clip_value, self.clip_value)
-            clip_fraction = (moved != clipped).to(value.dtype).mean()
+            share = (moved != clipped).to(value.dtype)
+            clip_fraction = reduced(self, share, tensordict, reduction="mean")
             loss = torch.maximum(
                 loss,
                 distance_loss(target, old_value + clipped, loss_function=self.loss_critic_type),
@@ -273,9 +283,9 @@ class CostCritic(CostValues):
         explained_variance = None
         if self.log_explained_variance:
             with torch.no_grad():
-                flat_target, flat_error = target.flatten(0, -2), (target - value).flatten(0, -2)
-                total = flat_target.var(0, correction=0) + torch.finfo(target.dtype).eps
-                explained_variance = 1 - flat_error.var(0, correction=0) / total
+                mask = counted(self, tensordict, target)
+                total = variances(target, mask) + torch.finfo(target.dtype).eps
+                explained_variance = 1 - variances(target - value, mask) / total
         # Summed, not averaged: each critic column then learns as fast with k costs as with one.
         loss = self.cost_critic_coeff * loss.sum(-1, keepdim=True)
         return loss, clip_fraction, explained_variance

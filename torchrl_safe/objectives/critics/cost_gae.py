@@ -7,11 +7,11 @@ from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
-from torchrl_safe.objectives._checks import check_share, refuse_options
+from torchrl_safe.objectives._checks import check_share, get_or_raise, refuse_options
 
 
 class CostGAE(GAE):
@@ -113,14 +113,15 @@ class CostGAE(GAE):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
-        self._check_single_steps(tensordict)
+        self._check(tensordict)
         return super().forward(tensordict, *args, **kwargs)
 
     def value_estimate(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Tensor:
-        self._check_single_steps(tensordict)
+        self._check(tensordict)
         return super().value_estimate(tensordict, *args, **kwargs)
 
-    def _check_single_steps(self, tensordict: TensorDictBase) -> None:
+    def _check(self, tensordict: TensorDictBase) -> None:
+        get_or_raise(tensordict, unravel_key(("next", self.tensor_keys.reward)))
         # The recursion goes on with the next step, which the sum already contains.
         if tensordict.get(key := self.tensor_keys.steps_to_next_obs, None) is not None:
             raise ValueError(

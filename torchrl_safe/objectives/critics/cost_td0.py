@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.value import TD0Estimator
 
-from torchrl_safe.objectives._checks import check_share, refuse_options
+from torchrl_safe.objectives._checks import check_share, get_or_raise, refuse_options
 
 
 class CostTD0(TD0Estimator):
@@ -85,7 +85,7 @@ class CostTD0(TD0Estimator):
         if next_value is None:
             # Of the base: what the value network says of the next step.
             next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
-        cost = tensordict.get(unravel_key(("next", keys.reward)))
+        cost = get_or_raise(tensordict, unravel_key(("next", keys.reward)))
         if cost.shape != next_value.shape:
             raise ValueError(
                 f"The cost {keys.reward!r} and its value {keys.value!r} must have one column for "

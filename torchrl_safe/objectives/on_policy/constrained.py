@@ -66,7 +66,7 @@ class ConstrainedLoss(CostCritic):
                 f"{type(self).__name__} compares the cost advantage with a violation, in the unit "
                 "of the cost: normalize_cost_advantage is not supported."
             )
-        self.normalize_cost_advantage = normalize_cost_advantage
+        self._normalize_cost_advantage = normalize_cost_advantage
         multiplier = initial_multiplier(self.num_costs, multiplier_init)
         if multiplier.any() and "lagrange_multiplier" not in self.cost_buffers:
             raise TypeError(
@@ -78,6 +78,11 @@ class ConstrainedLoss(CostCritic):
         if normalize_cost_advantage:
             scale = torch.zeros_like(multiplier, device=self.cost_critic_coeff.device)
             self.register_buffer("cost_advantage_scale", scale)
+
+    @property
+    def normalize_cost_advantage(self) -> bool:
+        """Whether cost advantages are divided by their standard deviation. Fixed once made."""
+        return self._normalize_cost_advantage
 
     @torch.no_grad()
     def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
@@ -93,7 +98,9 @@ class ConstrainedLoss(CostCritic):
 
         It may call ``self.evaluate(tensordict)``, the present policy of a PPO loss, and
         ``self.unconstrained(tensordict, advantage)``, the outputs of TorchRL's loss for any
-        advantage of shape ``(*B, 1)``; a PPO loss takes that policy as a third argument.
+        advantage of shape ``(*B, 1)``; a PPO loss takes that policy as a third argument. Reduce
+        terms of your own with :func:`~torchrl_safe.objectives.reduced`, and name them in the class
+        attribute ``policy_out_keys``.
 
         Args:
             tensordict (TensorDictBase): the data, a copy that may be written to.
@@ -118,6 +125,12 @@ class ConstrainedLoss(CostCritic):
 
     def _advantages(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         if not self._has_advantages(tensordict):
+            if tensordict.ndim < 2 and "time" not in tensordict.names:
+                raise ValueError(
+                    "The data must have a dimension of time for advantages to be estimated, got "
+                    f"shape {tuple(tensordict.shape)} without one named 'time'. Call "
+                    "estimate_advantages on the whole batch before you take minibatches of it."
+                )
             self._estimate_advantages(tensordict)
         cost_advantage = tensordict.get(self.tensor_keys.cost_advantage)
         self._check_width(self.tensor_keys.cost_advantage, cost_advantage)

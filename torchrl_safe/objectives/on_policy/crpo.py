@@ -8,20 +8,25 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._checks import check_columns, check_number, check_rows
+from torchrl_safe.objectives._checks import check_columns, check_rows, coefficients
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedLoss
 from torchrl_safe.objectives.on_policy.wrapped import WrappedLoss
 
 
 def rectified_advantage(
-    advantage: Tensor, cost_advantage: Tensor, violation: Tensor, tolerance: Tensor | float
+    advantage: Tensor,
+    cost_advantage: Tensor,
+    violation: Tensor,
+    tolerance: Tensor | float,
+    scale: Tensor | None = None,
 ) -> Tensor:
     r"""The reward advantage while every limit is kept, else that of lowering the worst cost.
 
     .. math::
         A = \begin{cases}
-            A_r & \text{if } J_{c_i} \le d_i + \eta \text{ for all } i \\
-            -A_{c_j} & \text{otherwise, with } j = \text{arg}\max_i (J_{c_i} - d_i)
+            A_r & \text{if } J_{c_i} \le d_i + \eta_i \text{ for all } i \\
+            -A_{c_j} & \text{otherwise, with } j = \text{arg}\max_i
+                (J_{c_i} - d_i - \eta_i) / s_i
         \end{cases}
 
     (Xu, Liang, Lan 2021, https://arxiv.org/abs/2011.05869, algorithm 1, which leaves open which
@@ -31,7 +36,10 @@ def rectified_advantage(
         advantage (Tensor): reward advantage, shape ``(*B, 1)``.
         cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
         violation (Tensor): mean episode cost minus limit, shape ``(k,)``.
-        tolerance (Tensor or float): the margin :math:`\eta`, in the unit of the episode cost.
+        tolerance (Tensor or float): the margins :math:`\eta_i`, in the units of the episode costs,
+            one number or shape ``(k,)``.
+        scale (Tensor, optional): the sizes :math:`s_i` by which violations in different units
+            compare, shape ``(k,)``; 0 counts as 1. Defaults to 1 for each cost.
 
     Returns:
         The advantage to maximize, shape ``(*B, 1)``.
@@ -51,8 +59,10 @@ def rectified_advantage(
     """
     check_columns(cost_advantage, "violation", violation)
     check_rows(advantage, cost_advantage)
-    worst = cost_advantage.index_select(-1, violation.argmax().reshape(1))
-    return torch.where(violation.max() > tolerance, -worst, advantage)
+    excess = violation - tolerance
+    relative = excess if scale is None else excess / torch.where(scale > 0, scale, 1.0)
+    worst = cost_advantage.index_select(-1, relative.argmax().reshape(1))
+    return torch.where((excess > 0).any(), -worst, advantage)
 
 
 class CRPOLoss(ConstrainedLoss, WrappedLoss):
@@ -61,7 +71,9 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
     Presented in "CRPO: A New Approach for Safe Reinforcement Learning with Convergence
     Guarantee", Xu, Liang, Lan 2021 (https://arxiv.org/abs/2011.05869). There is no multiplier: as
     long as every mean episode cost is within its limit and a tolerance, the loss is the wrapped
-    one, bit for bit; else its advantage is that of the cost that exceeds its limit most, negated. A
+    one, bit for bit; else its advantage is that of the cost that exceeds its limit most, negated.
+    With ``normalize_cost_advantage``, standard deviations of the cost advantages say which of
+    several costs that is, whatever their units. A
     :class:`~torchrl_safe.objectives.ViolationUpdater` brings the violations, once for each
     collected batch. The cost then swings about ``cost_limit + tolerance``. (The paper returns the
     policy of a randomly chosen step that maximized the reward.)
@@ -78,8 +90,8 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
 
     Keyword Args:
         num_costs (int, optional): number k of costs. Defaults to ``1``.
-        tolerance (float, optional): how far a limit may be exceeded, in the unit of the episode
-            cost. Defaults to ``0.0``.
+        tolerance (float or Tensor, optional): how far a limit may be exceeded, in the unit of the
+            episode cost; one number, or one for each cost, shape ``(k,)``. Defaults to ``0.0``.
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         separate_losses (bool, optional): leave parameters that the cost critic shares with the
@@ -127,7 +139,7 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
         cost_critic_network: TensorDictModuleBase,
         *,
         num_costs: int = 1,
-        tolerance: float = 0.0,
+        tolerance: float | Tensor = 0.0,
         cost_critic_coeff: float = 1.0,
         separate_losses: bool = False,
         normalize_cost_advantage: bool = True,
@@ -140,13 +152,14 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
             separate_losses=separate_losses,
             normalize_cost_advantage=normalize_cost_advantage,
         )
-        tolerance = check_number("tolerance", tolerance)
-        self.register_coeff_buffer("tolerance", tolerance, device=self.cost_critic_coeff.device)
+        tolerance = coefficients("tolerance", tolerance, num_costs)
+        self.register_buffer("tolerance", tolerance.to(self.cost_critic_coeff.device))
 
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
+        scale = self.cost_advantage_scale if self.normalize_cost_advantage else None
         rectified = rectified_advantage(
-            advantage, cost_advantage, self.cost_violation, self.tolerance
+            advantage, cost_advantage, self.cost_violation, self.tolerance, scale
         )
         return self.unconstrained(tensordict, rectified)

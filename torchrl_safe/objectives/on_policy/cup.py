@@ -121,6 +121,7 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
     """
 
     improved_actor_params: TensorDictParams
+    projecting: Tensor
 
     def __init__(
         self,
@@ -145,10 +146,14 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
         self.improved_actor_params = TensorDictParams(
             actor_params(self).data.clone(), no_convert=True
         )
+        self.register_buffer(
+            "projecting", torch.tensor(False, device=self.cost_critic_coeff.device)
+        )
 
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
+        self.projecting.fill_(False)
         return self.unconstrained(tensordict, advantage)
 
     def start_projection(self) -> None:
@@ -159,6 +164,7 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             self.improved_actor_params = TensorDictParams(present.clone(), no_convert=True)
         else:
             kept.update_(present)
+        self.projecting.fill_(True)
 
     def projection_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of the second phase. It trains the policy alone.
@@ -173,9 +179,13 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             divergence.
 
         Raises:
+            RuntimeError: if :meth:`start_projection` was not called since the first phase.
             KeyError: if the data have no ``cost_advantage``.
             ValueError: if the costs have another width than ``num_costs``.
         """
+        # Not in a compiled graph, which cannot branch on a tensor.
+        if not torch.compiler.is_compiling() and not self.projecting:
+            raise RuntimeError("Call start_projection before the first projection_loss of a batch.")
         tensordict = tensordict.clone(False)
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
         improved = self._improved_policy(tensordict)

@@ -9,7 +9,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives._checks import check_number
+from torchrl_safe.objectives._checks import coefficients
 from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
@@ -80,8 +80,9 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
 
     Keyword Args:
         num_costs (int, optional): number k of costs. Defaults to ``1``.
-        sharpness (float, optional): the paper's t: the larger, the closer to the limit the
-            barrier acts. Defaults to ``20.0``.
+        sharpness (float or Tensor, optional): the paper's t: the larger, the closer to the limit
+            the barrier acts; one number, or one for each cost, shape ``(k,)``. Defaults to
+            ``20.0``.
         episode_length (float, optional): mean number of steps of an episode, to compare a
             surrogate, which is about one step, with a violation, which is about an episode.
             Defaults to :math:`1 / (1 - \gamma)`, as in the equation above.
@@ -124,7 +125,7 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         cost_critic_network: TensorDictModuleBase,
         *,
         num_costs: int = 1,
-        sharpness: float = 20.0,
+        sharpness: float | Tensor = 20.0,
         episode_length: float | None = None,
         cost_critic_coeff: float = 1.0,
         **kwargs: Any,
@@ -138,8 +139,8 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
-        sharpness = check_number("sharpness", sharpness, positive=True)
-        self.register_coeff_buffer("sharpness", sharpness, device=self.cost_critic_coeff.device)
+        sharpness = coefficients("sharpness", sharpness, num_costs, positive=True)
+        self.register_buffer("sharpness", sharpness.to(self.cost_critic_coeff.device))
 
     def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:
         # J_c(pi_theta) - d

@@ -8,7 +8,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives._checks import check_number
+from torchrl_safe.objectives._checks import coefficients
 from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
@@ -68,8 +68,9 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
 
     Keyword Args:
         num_costs (int, optional): number k of costs. Defaults to ``1``.
-        penalty_coeff (float, optional): the factor :math:`\kappa`, in units of standardized
-            reward advantage per cost advantage. Defaults to ``20.0``.
+        penalty_coeff (float or Tensor, optional): the factor :math:`\kappa`, in units of
+            standardized reward advantage per cost advantage; one number, or one for each cost,
+            shape ``(k,)``. Defaults to ``20.0``.
         episode_length (float, optional): mean number of steps of an episode, to compare a
             surrogate, which is about one step, with a violation, which is about an episode.
             Defaults to :math:`1 / (1 - \gamma)`, as in the equation above.
@@ -112,7 +113,7 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
         cost_critic_network: TensorDictModuleBase,
         *,
         num_costs: int = 1,
-        penalty_coeff: float = 20.0,
+        penalty_coeff: float | Tensor = 20.0,
         episode_length: float | None = None,
         cost_critic_coeff: float = 1.0,
         **kwargs: Any,
@@ -126,9 +127,8 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
-        penalty_coeff = check_number("penalty_coeff", penalty_coeff, positive=True)
-        device = self.cost_critic_coeff.device
-        self.register_coeff_buffer("penalty_coeff", penalty_coeff, device=device)
+        penalty_coeff = coefficients("penalty_coeff", penalty_coeff, num_costs, positive=True)
+        self.register_buffer("penalty_coeff", penalty_coeff.to(self.cost_critic_coeff.device))
 
     def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:
         # kappa max(0, surrogate + (1 - gamma) (J_c - d))

@@ -55,13 +55,22 @@ class CostSurrogate(ConstrainedPPO):
 
     def __init__(self, *args: Any, episode_length: float | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.episode_length = check_episode_length(episode_length)
+        self.episode_length = episode_length
         if self.reduction != "mean":
             raise ValueError(
                 "reduction must be 'mean', since the penalty is a function of the batch mean, got "
                 f"{self.reduction!r}."
             )
         self._asymmetric = isinstance(kwargs.get("clip_epsilon"), tuple | list)
+
+    @property
+    def episode_length(self) -> float | None:
+        """Mean number of steps of an episode. You can set what the constructor takes."""
+        return self._episode_length
+
+    @episode_length.setter
+    def episode_length(self, episode_length: float | None) -> None:
+        self._episode_length = check_episode_length(episode_length)
 
     @abc.abstractmethod
     def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:

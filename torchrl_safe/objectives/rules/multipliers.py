@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
-from torchrl_safe._checks import check_flag
+from torchrl_safe._checks import check_flag, check_kind
 from torchrl_safe.objectives._checks import as_number, check_number
 from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
@@ -88,11 +88,20 @@ class MultiplierUpdater(CostUpdater):
         super().__init__(
             loss_module, cost_limit=cost_limit, pessimism=pessimism, cost_names=cost_names
         )
-        if max_multiplier is not None and as_number(max_multiplier) != math.inf:
-            max_multiplier = check_number("max_multiplier", max_multiplier, positive=True)
         self.max_multiplier = max_multiplier
         # The largest so far, slowly forgotten.
         self.cost_scale = torch.zeros_like(self.cost_limit)
+
+    @property
+    def max_multiplier(self) -> float | None:
+        """The largest multiplier, if there is one. You can set what the constructor takes."""
+        return self._max_multiplier
+
+    @max_multiplier.setter
+    def max_multiplier(self, bound: float | None) -> None:
+        if bound is not None and as_number(bound) != math.inf:
+            bound = check_number("max_multiplier", bound, positive=True)
+        self._max_multiplier = bound
 
     def _as_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> Tensor:
         limit = super()._as_limit(cost_limit)
@@ -109,7 +118,11 @@ class MultiplierUpdater(CostUpdater):
             scale = torch.maximum(current, past)
             violation = torch.where(scale > 0, violation / scale, 0.0).clamp(-1, 1)
             cost_scale = torch.maximum(current, past.lerp(current, _FORGOTTEN))
-        proposal = self.next_multiplier(buffer, violation)
+        proposal = self.next_multiplier(buffer.clone(), violation)
+        if not isinstance(proposal, Tensor):
+            raise TypeError(
+                f"next_multiplier must return a tensor of shape ({len(buffer)},), got {proposal!r}."
+            )
         # A proposal of infinity is one beyond the bound, if there is one.
         projected = proposal.clamp(0, self.max_multiplier)
         if projected.shape != buffer.shape or not projected.isfinite().all():
@@ -134,7 +147,7 @@ class MultiplierUpdater(CostUpdater):
         """Proposes the next multipliers; ``step`` projects them on ``[0, max_multiplier]``.
 
         Args:
-            multiplier (Tensor): current multipliers, shape ``(k,)``. Not to be changed.
+            multiplier (Tensor): current multipliers, shape ``(k,)``.
             violation (Tensor): mean episode cost minus limit, shape ``(k,)``, with ``pessimism``
                 and ``normalize`` as they were chosen.
 
@@ -232,6 +245,7 @@ class DualAscent(MultiplierUpdater):
             cost_names=cost_names,
         )
         lr = check_number("lr", lr, positive=True)
+        check_kind("parametrization", parametrization, Transform, such_as="SoftplusTransform()")
         multiplier = loss_module.lagrange_multiplier
         if not parametrization.inv(multiplier).isfinite().all():
             raise ValueError(
@@ -240,6 +254,8 @@ class DualAscent(MultiplierUpdater):
             )
         self.parametrization = parametrization
         self._parameter = torch.zeros_like(multiplier)
+        if not callable(optimizer):
+            raise TypeError(f"optimizer must be a class such as torch.optim.Adam, got {optimizer}.")
         self.optimizer = optimizer([self._parameter], lr=lr)
 
     def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:

@@ -13,7 +13,7 @@ from torch.nn.parameter import is_lazy
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe._checks import check_count
+from torchrl_safe._checks import check_count, check_kind
 from torchrl_safe.objectives._checks import (
     as_number,
     check_episode_length,
@@ -157,6 +157,7 @@ class TrustRegionStep:
         dtype: torch.dtype = torch.float64,
     ) -> None:
         loss_module = uncompiled(loss_module)
+        check_kind("method", method, TrustRegionMethod, such_as="TRPO()")
         _check_loss(loss_module, method)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             raise ValueError(f"dtype must be a floating-point torch.dtype, got {dtype!r}.")
@@ -166,8 +167,8 @@ class TrustRegionStep:
             raise ValueError(f"shrink must be more than 0 and less than 1, got {shrink!r}.")
         self.loss_module = loss_module
         self.method = method
-        self.episode_length = check_episode_length(episode_length)
-        self.max_kl = check_number("max_kl", max_kl, positive=True)
+        self.episode_length = episode_length
+        self.max_kl = max_kl
         self.damping = check_number("damping", damping)
         self.cg_iterations = cg_iterations
         self.shrink = as_number(shrink)
@@ -176,6 +177,24 @@ class TrustRegionStep:
         self.rejected_steps = 0
         self.indefinite_steps = 0
         self.recovery_steps = 0
+
+    @property
+    def episode_length(self) -> float | None:
+        """Mean number of steps of an episode. You can set what the constructor takes."""
+        return self._episode_length
+
+    @episode_length.setter
+    def episode_length(self, episode_length: float | None) -> None:
+        self._episode_length = check_episode_length(episode_length)
+
+    @property
+    def max_kl(self) -> float:
+        """Bound on the mean divergence of one step, in nats. You can set it."""
+        return self._max_kl
+
+    @max_kl.setter
+    def max_kl(self, max_kl: float) -> None:
+        self._max_kl = check_number("max_kl", max_kl, positive=True)
 
     def step(self, tensordict: TensorDictBase) -> TensorDict:
         """Moves the actor once.
