@@ -323,7 +323,8 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         settings=_A2C,
     ),
     "trpo": _trust_region(updater=keep_multiplier, method=TRPO()),
-    "trpo-lagrangian": _trust_region(method=TRPO()),
+    # One step for each batch: with 128,000 control steps one seed had not learnt to the end.
+    "trpo-lagrangian": _trust_region(method=TRPO(), settings={"frames": 256_000}),
     "cpo": _trust_region(
         updater=partial(tell_violation, errors=2.0),
         method=CPO(),
