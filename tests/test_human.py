@@ -5,7 +5,7 @@ from worlds import each_arm, rest, turn
 from torchrl_safe.envs import ArmEnv, Capsule, Collision, Human, Region, Sphere
 from torchrl_safe.envs.physics.paths import look_ahead
 
-pytestmark = pytest.mark.usefixtures("engine")
+both_engines = pytest.mark.usefixtures("engine")
 
 RATE = 240
 START, GOAL = np.array([0.35, 0.0, 0.2]), np.array([0.65, 0.1, 0.1])
@@ -125,6 +125,7 @@ def test_same_generator_same_motion():
     assert not np.allclose(one, three, atol=1e-3)
 
 
+@both_engines
 @each_arm
 def test_arms_at_home_are_out_of_reach_at_first(make_env, arm):
     """No draw is thrown away: a person stands still when an episode begins."""

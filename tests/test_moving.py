@@ -22,7 +22,7 @@ from torchrl_safe.envs import (
     Swing,
 )
 
-pytestmark = pytest.mark.usefixtures("engine")
+both_engines = pytest.mark.usefixtures("engine")
 
 RATE = 240
 START, GOAL = np.array([0.3, 0, 0.2]), np.ones(3)
@@ -163,6 +163,7 @@ def test_nothing_moves_nowhere():
     assert placement.present.shape == (0,)
 
 
+@both_engines
 def test_the_simulator_follows_the_path(make_env, engine):
     """Bodies are where the path says, at every control step, and as fast as it says."""
     layout = Moving(
@@ -193,6 +194,7 @@ def test_the_simulator_follows_the_path(make_env, engine):
     assert np.abs(velocity).max() > 0.05
 
 
+@both_engines
 def test_turning_is_a_velocity(make_env):
     """A block that turns by 2 rad/s about z, and one that stands still."""
 
@@ -216,6 +218,7 @@ def test_turning_is_a_velocity(make_env):
     np.testing.assert_allclose(x, [np.cos(0.5), np.sin(0.5), 0], atol=1e-9)
 
 
+@both_engines
 def test_motion_begins_anew_with_the_episode(make_env):
     """It begins at time 0 of a new draw, and other worlds keep their time."""
     settings = {"num_envs": 2, "obstacles": Moving(InFront(), Swing(period=0.7)), "seed": 3}
@@ -236,6 +239,7 @@ def test_motion_begins_anew_with_the_episode(make_env):
     assert not np.allclose(noted[0][0].position, noted[1][0].position)
 
 
+@both_engines
 def test_the_clock_of_a_frame_skip(make_env):
     """The path does not depend on the length of the control steps."""
     layout = Moving(Places(Sphere(), at=[(0.7, 0, 0.4)]), Patrol())
@@ -250,6 +254,7 @@ def test_the_clock_of_a_frame_skip(make_env):
     np.testing.assert_allclose(ends[0], ends[2], atol=1e-12)
 
 
+@both_engines
 def test_it_does_not_stop_for_the_arm(make_env):
     """The arm in its way is pushed aside, and the obstacle follows its path."""
     layout = Moving(Places(Sphere(0.06), at=[(0.35, 0.15, 0.2)]), Patrol(distance=0.3, speed=0.4))
@@ -269,6 +274,7 @@ def test_it_does_not_stop_for_the_arm(make_env):
     assert np.linalg.norm(env.arm_state.ee_position - start) > 0.01
 
 
+@both_engines
 @pytest.mark.parametrize(
     ("make", "kind", "message"),
     [
@@ -302,6 +308,7 @@ def test_bad_arguments(make, kind, message):
         make()
 
 
+@both_engines
 def test_what_moves_must_be_fixed(make_env):
     """A path for a shape with a mass would fight physics."""
     path = Placement([[0.6, 0, 0.1]]).at
@@ -310,6 +317,7 @@ def test_what_moves_must_be_fixed(make_env):
         ArmEnv(obstacles=layout)
 
 
+@both_engines
 @pytest.mark.parametrize(
     ("path", "message"),
     [

@@ -14,7 +14,7 @@ from torchrl_safe.envs import (
     paper_observation,
 )
 
-pytestmark = pytest.mark.usefixtures("engine")
+both_engines = pytest.mark.usefixtures("engine")
 
 FIELDS = {
     "joint_position": 7,
@@ -48,6 +48,7 @@ def several(count, **changes):
     return make_state(**{**fields, **changes})
 
 
+@both_engines
 def test_fields_and_slices(make_env):
     """In the documented order, one after the other."""
     env = make_env(
@@ -171,6 +172,7 @@ def test_objects():
     assert FullObservation()(make_state(**bodies("object", 0)))["to_object"].shape == (2, 0)
 
 
+@both_engines
 def test_one_policy_for_any_number(make_env):
     """In the simulator: the second of two is nearest, and widths agree."""
     at = [(0.6, -0.5, 0.1), (0.6, 0.0, 0.1)]

@@ -19,7 +19,7 @@ from torchrl_safe.envs import (
     Scattered,
 )
 
-pytestmark = pytest.mark.usefixtures("engine")
+both_engines = pytest.mark.usefixtures("engine")
 
 START, GOAL = np.array([0.35, 0.0, 0.2]), np.array([0.65, 0.1, 0.1])
 RNG = np.random.default_rng(0)
@@ -144,6 +144,7 @@ def test_scattered_needs_room():
         layout.sample(RNG, START, GOAL)
 
 
+@both_engines
 @pytest.mark.parametrize("task", [None, Push()], ids=["reach", "push"])
 def test_scattered_leaves_arm_and_object_free(make_env, task):
     """In 200 worlds, however they are drawn; a step in which nothing moves costs nothing."""
@@ -162,6 +163,7 @@ def test_scattered_leaves_arm_and_object_free(make_env, task):
     assert not rest(env)["cost"][:, 0].any()
 
 
+@both_engines
 @pytest.mark.parametrize("mass", [0.0, 1.0], ids=["fixed", "free"])
 def test_what_is_absent_is_nowhere(make_env, engine, mass):
     """No contact, no distance, zeros in the observation, and nothing in the picture."""
@@ -196,6 +198,7 @@ def test_what_is_absent_is_nowhere(make_env, engine, mass):
     assert torch.equal(env.render(64, 48), alone.render(64, 48))
 
 
+@both_engines
 def test_presence_changes_with_the_episode(make_env):
     env = make_env(ArmEnv, obstacles=Scattered(2, fewest=0), seed=0)
     seen = set()
@@ -210,6 +213,7 @@ def test_presence_changes_with_the_episode(make_env):
     assert seen == {0, 1, 2}
 
 
+@both_engines
 def test_a_layout_of_ones_own(make_env):
     """In ten lines: a gate of two posts before the goal."""
 
@@ -255,6 +259,7 @@ def test_bad_placements(arguments, message):
         Placement(**arguments)
 
 
+@both_engines
 @pytest.mark.parametrize(
     ("make", "message"),
     [

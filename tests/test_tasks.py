@@ -18,7 +18,7 @@ from torchrl_safe.envs import (
     Region,
 )
 
-pytestmark = pytest.mark.usefixtures("engine")
+both_engines = pytest.mark.usefixtures("engine")
 
 GRIP = CartesianDelta(finger_step=0.04)
 each_object_task = pytest.mark.parametrize("kind", [Push, PickAndPlace])
@@ -190,6 +190,7 @@ def test_reward_of_picking_up_is_progress():
     np.testing.assert_allclose(PickAndPlace().reward(placed), [0, 10 + way / 0.05], atol=1e-9)
 
 
+@both_engines
 @pytest.mark.parametrize(("kind", "width"), [(Push, 3), (PickAndPlace, 4)])
 @pytest.mark.parametrize("name", ["panda", "xarm6"])
 def test_progress_adds_up_to_the_way(make_env, name, kind, width):
@@ -256,6 +257,7 @@ def test_object_tasks_reject(task, arguments, kind, message):
         task(**arguments)
 
 
+@both_engines
 @each_object_task
 def test_region_must_be_wide_enough(kind):
     """It says so when the environment is made."""
@@ -276,11 +278,13 @@ def test_fingers_close_on_what_is_as_wide_as_deep():
         PickAndPlace(shape=Box((0.02, 0.03, 0.02), mass=0.1))
 
 
+@both_engines
 def test_picking_needs_fingers():
     with pytest.raises(ValueError, match="action must move the fingers to pick something up"):
         ArmEnv(task=PickAndPlace())
 
 
+@both_engines
 @pytest.mark.parametrize(
     ("task", "what"),
     [
@@ -294,6 +298,7 @@ def test_unreachable_goals(task, what):
         ArmEnv(task=task, obstacles=NoObstacles())
 
 
+@both_engines
 @pytest.mark.parametrize("name", ARMS)
 def test_objects_lie_still(make_env, name):
     """Where they were put, on the table, until something touches them."""
@@ -309,6 +314,7 @@ def test_objects_lie_still(make_env, name):
     assert np.abs(state.object_angular_velocity).max() < 0.05
 
 
+@both_engines
 @each_arm
 def test_the_arm_pushes_the_object(make_env, arm):
     """Down before the cube, then into it: it goes where the tool goes, and the reward follows."""
@@ -330,6 +336,7 @@ def test_the_arm_pushes_the_object(make_env, arm):
     assert result["reward"].item() == pytest.approx(reward, abs=1e-6)
 
 
+@both_engines
 def test_the_first_object_is_where_the_way_begins(make_env):
     """Obstacles of a pushing task stand between cube and goal."""
 
