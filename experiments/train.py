@@ -46,24 +46,14 @@ from torchrl_safe.envs import (
     Collision,
     ContactForce,
     FullObservation,
-    Human,
-    InFront,
     JointDelta,
     JointLimit,
-    Moving,
     MuJoCo,
-    NoObstacles,
-    Obstacles,
     Physics,
-    PickAndPlace,
     Proximity,
-    Push,
-    Reach,
-    Scattered,
     ShieldCorrection,
     Speed,
     SpeedAndSeparation,
-    Task,
     gym,
     paper_env,
     paper_observation,
@@ -72,19 +62,15 @@ from torchrl_safe.envs.arm_env import Cost
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.policy import load_policy, save_policy
 
-# The tasks, with control steps enough for an episode.
-TASKS: dict[str, tuple[Task, int]] = {
-    "reach": (Reach(), 40),
-    "push": (Push(), 200),
-    "pick-and-place": (PickAndPlace(), 100),
-}
-ARMS = {name.lower(): arm for name, arm in gym.ARMS.items()}
-OBSTACLES: dict[str, Obstacles] = {
-    "none": NoObstacles(),
-    "in-front": InFront(),
-    "scattered": Scattered(),
-    "moving": Moving(),
-    "human": Human(),
+# What options are called in the names that Gymnasium knows.
+ARMS = {name.lower(): name for name in gym.ARMS}
+TASKS = {"reach": "Reach", "push": "Push", "pick-and-place": "PickAndPlace"}
+OBSTACLES = {
+    "none": "",
+    "in-front": "InFront",
+    "scattered": "Scattered",
+    "moving": "Moving",
+    "human": "Human",
 }
 PHYSICS: dict[str, Physics] = {"bullet": Bullet(), "mujoco": MuJoCo()}
 PAPER_ACTIONS: dict[str, ActionMode] = {"cartesian": PAPER_CARTESIAN, "joint": PAPER_JOINT}
@@ -148,14 +134,11 @@ def arm_arguments(config: Config, shielded: bool = True) -> dict[str, Any]:
     """What the arm, its task and its costs are, as arguments of ArmEnv."""
     if config.suite_task is not None:
         return SUITE[config.suite_task].arguments
-    task, steps = TASKS[config.task]
+    arm, task, obstacles = ARMS[config.arm], TASKS[config.task], OBSTACLES[config.obstacles]
     return {
-        "arm": ARMS[config.arm],
+        **gym.combination(arm, task, obstacles, action=""),
         "action": make_action(config),
-        "task": task,
-        "obstacles": OBSTACLES[config.obstacles],
         "costs": {name: COSTS[name] for name in cost_names(config, shielded)},
-        "max_episode_steps": steps,
     }
 
 
@@ -172,7 +155,7 @@ def make_action(config: Config) -> ActionMode:
     if config.action == "joint":
         return JointDelta(finger_step=fingers)
     # At the speed of reaching, 1 m/s, a cube that is hit slides on for 0.2 m.
-    held = ARMS[config.arm].handling_orientation
+    held = gym.ARMS[ARMS[config.arm]].handling_orientation
     return CartesianDelta(step=0.03, orientation=held, finger_step=fingers)
 
 
