@@ -272,7 +272,7 @@ def test_steps_are_whole_numbers(run, step):
 
 
 def test_settings_that_are_nan_are_the_same(tmp_path, net):
-    settings = {"lr": float("nan")}
+    settings = {"lr": float("nan"), "inner": {"rate": float("nan")}}
     RunCheckpoints(tmp_path, {"net": net}, settings=settings).save(1)
     assert RunCheckpoints(tmp_path, {"net": net}, settings=settings).load() == 1
 

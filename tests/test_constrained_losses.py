@@ -381,6 +381,16 @@ def test_a_cost_critic_that_writes_another_key_is_named():
             PPOLagrangianLoss(actor, critic, wrong)
 
 
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+def test_a_compiled_cost_critic():
+    actor, critic, cost_critic = make_networks(2)
+    compiled = torch.compile(cost_critic, backend="eager")
+    loss = PPOLagrangianLoss(actor, critic, compiled, num_costs=2, functional=False)
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    loss(data)["loss_cost_critic"].backward()
+    assert all(parameter.grad.any() for parameter in cost_critic.parameters())
+
+
 def test_what_was_chosen_when_it_was_made_stays():
     loss = PPOLagrangianLoss(*make_networks(), normalize_cost_advantage=False)
     with pytest.raises(AttributeError):

@@ -11,7 +11,14 @@ from rules import episodes, make_module
 from torch.distributions.transforms import ExpTransform, SoftplusTransform
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives import DualAscent, MultiplierUpdater, PIDControl
+from torchrl_safe.objectives import (
+    DualAscent,
+    MultiplierUpdater,
+    P3OLoss,
+    PIDControl,
+    ViolationUpdater,
+)
+from torchrl_safe.testing import make_networks
 
 NAN, INF = float("nan"), float("inf")
 
@@ -120,7 +127,7 @@ def test_a_bound_that_is_set_later_is_checked():
     ("argument", "value", "message"),
     [
         ("parametrization", "softplus", r"must be an instance of Transform, got 'softplus'"),
-        ("optimizer", "adam", r"must be a class such as torch.optim.Adam, got adam"),
+        ("optimizer", "adam", r"must be a class such as torch.optim.Adam, got 'adam'"),
     ],
 )
 def test_what_dual_ascent_is_made_of_is_checked(argument, value, message):
@@ -147,6 +154,32 @@ def test_a_rule_that_returns_no_tensor_changes_nothing(value):
     with pytest.raises(TypeError, match=r"must return a tensor of shape \(1,\), got"):
         Forgetful(loss, cost_limit=0.0).step(torch.ones(1, 1))
     assert loss.lagrange_multiplier.item() == 1.0
+
+
+def test_an_optimizer_is_as_it_was_if_a_rule_returns_no_tensor():
+    class Forgetful(DualAscent):
+        def next_multiplier(self, multiplier, violation):
+            super().next_multiplier(multiplier, violation)
+
+    rule = Forgetful(make_module(1.0), cost_limit=0.0, lr=0.1, optimizer=torch.optim.Adam)
+    with pytest.raises(TypeError, match="must return a tensor"):
+        rule.step(torch.ones(1, 1))
+    assert not rule.optimizer.state_dict()["state"]
+
+
+def test_the_bound_of_a_state_is_checked_before_anything_is_loaded():
+    rule = DualAscent(make_module(1.0), cost_limit=1.0, lr=0.1)
+    state = {**rule.state_dict(), "max_multiplier": -1.0, "cost_limit": torch.tensor([7.0])}
+    with pytest.raises(ValueError, match="max_multiplier must be positive"):
+        rule.load_state_dict(state)
+    assert rule.cost_limit.item() == 1.0
+
+
+def test_violations_in_half_precision_are_told():
+    """They are not summed up."""
+    loss = P3OLoss(*make_networks()).to(torch.bfloat16)
+    ViolationUpdater(loss, cost_limit=1.0).step(torch.full((2, 1), 3.0))
+    assert loss.cost_violation.item() == 2.0
 
 
 NAMED = {"collision": 0.5, "speed": 2.0}

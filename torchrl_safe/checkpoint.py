@@ -232,4 +232,7 @@ def refuse_other_settings(saved: Mapping[str, Any], settings: Mapping[str, Any])
 
 def _differs(one: Any, other: Any) -> bool:
     """Also by the order of entries: costs, for example, are columns. NaN is like NaN."""
-    return json.dumps(one) != json.dumps(other)
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return list(one) != list(other) or any(_differs(one[key], other[key]) for key in one)
+    both_nan = one != one and other != other
+    return one != other and not both_nan

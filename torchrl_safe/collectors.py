@@ -86,8 +86,8 @@ class ResumableCollector(Collector):
                 level.load_state_dict(state_dict[f"inner_env_{n}"])
         if "torch_generator" in state_dict and "carrier" not in state_dict:
             warnings.warn(
-                "Episodes begin anew, so the run differs from one that was not stopped: the state "
-                "of the environment was not saved. It needs get_extra_state, no ParallelEnv and no "
+                "Episodes begin anew, so the run differs from one that was not stopped. Only those "
+                "of environments with get_extra_state go on, and not in a ParallelEnv or with "
                 "trajs_per_batch.",
                 stacklevel=2,
             )

@@ -169,10 +169,10 @@ def save_policy(
 
     Raises:
         TypeError: if ``actor`` or ``observation_spec`` is not of its kind.
-        ValueError: if the actor cannot be saved. Either :func:`load_policy` made it; copy the file
-            instead. Or it reads several keys (a recurrent actor reads its state) or writes no
-            action. Or it cannot be copied, called or recorded; Python code in it must not decide
-            by the values of a tensor, as that of :class:`~torchrl.modules.TruncatedNormal` does.
+        ValueError: if the actor cannot be saved. It comes from :func:`load_policy`: copy the file
+            instead. It reads several keys (a recurrent actor reads its state) or writes no action.
+            It cannot be copied, called or recorded: Python code in it must not decide by the
+            values of a tensor, as that of :class:`~torchrl.modules.TruncatedNormal` does.
 
     Examples:
         >>> import tempfile

@@ -31,9 +31,9 @@ class Collision:
         margin: distance from an obstacle that counts as a touch, m. It is measured, which takes
             time, and from the base of the arm too.
         table: count touches of the table too (not of what the base stands on).
-        itself: count links of the arm that touch each other, unless they also do at home or where
-            the gripper is fully open or closed. Links then collide; without it they pass through
-            each other.
+        itself: count links of the arm that touch each other. Those that touch at home, or with the
+            gripper fully open or closed, never count. Links then collide; without it they pass
+            through each other.
 
     Raises:
         ValueError: if ``margin`` is negative or not finite.

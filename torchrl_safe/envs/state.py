@@ -56,7 +56,8 @@ class Sensing:
         table: gives ``table_distance`` (m, ``(N, s)``): the smallest distance of a contact
             point between the table and the arm without its base, infinite without contact.
         itself: gives ``self_distance`` (m, ``(N, s)``), the same between links of the arm that
-            do not touch by design. Links then collide, which they otherwise do not.
+            touch neither at home nor with the gripper fully open or closed. Links then collide,
+            which they otherwise do not.
         joints: gives ``joint_position`` (rad, ``(N, s, n)``).
         tool: gives ``ee_position`` (m) and ``ee_velocity`` (m/s), each ``(N, s, 3)``.
         links: gives ``link_speed`` (m/s, ``(N, s, l)``), of every link's centre of mass.

@@ -40,10 +40,11 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
 
 def coefficients(name: str, value: Any, num_costs: int, *, positive: bool = False) -> Tensor:
     """One number, shape ``()``, or one for each cost, ``(k,)``; see :func:`check_number`."""
-    if not isinstance(value, Tensor) or not value.ndim:
+    if as_tensor(name, value, torch.get_default_dtype()).ndim == 0:
         return torch.tensor(check_number(name, value, positive=positive))
-    check_one_each(name, value, num_costs)
-    return torch.tensor([check_number(name, each, positive=positive) for each in value])
+    numbers = [check_number(name, number, positive=positive) for number in value]
+    check_one_each(name, torch.tensor(numbers), num_costs)
+    return torch.tensor(numbers)
 
 
 def check_share(name: str, value: Any) -> float:

@@ -41,8 +41,9 @@ def reduced(
         ValueError: if a mask is not bool or does not fit the values.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_safe.objectives import PPOLagrangianLoss
+        >>> from torchrl_safe.objectives import PPOLagrangianLoss, reduced
         >>> from torchrl_safe.testing import make_networks
         >>> loss = PPOLagrangianLoss(*make_networks())
         >>> mask = torch.tensor([[True], [True], [False]])

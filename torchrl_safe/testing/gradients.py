@@ -287,10 +287,12 @@ def check_q_multiplier_direction(
         num_costs (int, optional): number k of costs, at most as many as the action has numbers.
         make_networks (callable, optional): see :func:`check_equals_at_zero`.
         make_data (callable, optional): see :func:`check_equals_at_zero`.
+            The data have ``observation`` and ``action`` under these names.
         constrain (callable, optional): see :func:`check_equals_at_zero`.
 
     Raises:
         AssertionError: if a multiplier pushes the wrong way, or acts through another column.
+        ValueError: if ``num_costs`` is more than an action has numbers.
 
     Examples:
         >>> from functools import partial
@@ -305,6 +307,11 @@ def check_q_multiplier_direction(
     data, parameters = make_data(num_costs), list(actor.parameters())
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         action = call(actor, data)["action"].mean(0)
+    if not 1 <= num_costs <= len(action):
+        raise ValueError(
+            f"num_costs must be at least 1 and at most the {len(action)} numbers of an action, got "
+            f"{num_costs}."
+        )
     uphill = [_gradient(action[index], parameters) for index in range(num_costs)]
     for index in range(num_costs):
         strength = torch.zeros(num_costs)

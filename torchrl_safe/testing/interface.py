@@ -112,11 +112,15 @@ def check_keys(
                 old, new = unravel_key(old), unravel_key(new)
                 if data.get(old, None) is not None:
                     data.rename_key_(old, new)
-        return call(loss, data)
+        try:
+            return call(loss, data)
+        except KeyError as error:
+            raise AssertionError(f"{named(loss)} with set_keys(**{keys}): {error}") from error
 
     expected = run({})
+    forms: list[NestedKey] = ["renamed", ("nested", "renamed")] if nested else ["renamed"]
     for name in names:
-        for key in ("renamed", ("nested", "renamed"))[: 1 + nested]:
+        for key in forms:
             what = f"with set_keys({name}={key!r})"
             require_same_outputs(what, run({name: key}), expected)
     every = {name: ("nested", "deeper", name) if nested else f"{name}_2" for name in names}

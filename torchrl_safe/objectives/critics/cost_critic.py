@@ -22,7 +22,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count, check_kind
-from torchrl_safe.objectives._checks import check_number, get_or_raise
+from torchrl_safe.objectives._checks import check_number, get_or_raise, uncompiled
 from torchrl_safe.objectives._reduction import counted, expanded_mask, reduced, variances
 from torchrl_safe.objectives.critics.cost_gae import CostGAE
 from torchrl_safe.objectives.critics.cost_values import CostValues
@@ -68,7 +68,7 @@ class CostCritic(CostValues):
     ) -> None:
         check_count(num_costs=num_costs)
         cost_critic_coeff = check_number("cost_critic_coeff", cost_critic_coeff)
-        check_kind("cost_critic_network", cost_critic_network, TensorDictModuleBase)
+        check_kind("cost_critic_network", uncompiled(cost_critic_network), TensorDictModuleBase)
         # The parent's constructor already sets keys, before a module can be assigned.
         self._cost_critic_in_keys = list(cost_critic_network.in_keys)
         self._shared_keys: list[NestedKey] = []
@@ -118,7 +118,8 @@ class CostCritic(CostValues):
         ``("collector", "mask")``, also end it.
 
         Call it on the batch as it was collected. A call of the loss with data without advantages
-        does the same first, and refuses a minibatch of single steps.
+        does the same first, if they have a dimension of time; it cannot tell whether you have
+        shuffled them.
 
         Args:
             tensordict (TensorDictBase): a batch as collectors return it, shape ``(*B, T)``.

@@ -129,7 +129,8 @@ class ConstrainedLoss(CostCritic):
                 raise ValueError(
                     "The data must have a dimension of time for advantages to be estimated, got "
                     f"shape {tuple(tensordict.shape)} without one named 'time'. Call "
-                    "estimate_advantages on the whole batch before you take minibatches of it."
+                    "estimate_advantages on the whole batch before you take minibatches of it. If "
+                    "these steps are in order, set data.names = ['time']."
                 )
             self._estimate_advantages(tensordict)
         cost_advantage = tensordict.get(self.tensor_keys.cost_advantage)

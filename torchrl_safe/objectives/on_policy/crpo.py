@@ -39,7 +39,7 @@ def rectified_advantage(
         tolerance (Tensor or float): the margins :math:`\eta_i`, in the units of the episode costs,
             one number or shape ``(k,)``.
         scale (Tensor, optional): the sizes :math:`s_i` by which violations in different units
-            compare, shape ``(k,)``; 0 counts as 1. Defaults to 1 for each cost.
+            compare, shape ``(k,)``. A cost of size 0 comes last. Defaults to 1 for each cost.
 
     Returns:
         The advantage to maximize, shape ``(*B, 1)``.
@@ -60,7 +60,10 @@ def rectified_advantage(
     check_columns(cost_advantage, "violation", violation)
     check_rows(advantage, cost_advantage)
     excess = violation - tolerance
-    relative = excess if scale is None else excess / torch.where(scale > 0, scale, 1.0)
+    relative = excess
+    if scale is not None:  # It is 0 for all costs until advantages are estimated.
+        sizes = torch.where(scale > 0, scale, torch.inf)
+        relative = torch.where((scale > 0).any(), excess / sizes, excess)
     worst = cost_advantage.index_select(-1, relative.argmax().reshape(1))
     return torch.where((excess > 0).any(), -worst, advantage)
 
@@ -72,8 +75,8 @@ class CRPOLoss(ConstrainedLoss, WrappedLoss):
     Guarantee", Xu, Liang, Lan 2021 (https://arxiv.org/abs/2011.05869). There is no multiplier: as
     long as every mean episode cost is within its limit and a tolerance, the loss is the wrapped
     one, bit for bit; else its advantage is that of the cost that exceeds its limit most, negated.
-    With ``normalize_cost_advantage``, standard deviations of the cost advantages say which of
-    several costs that is, whatever their units. A
+    With ``normalize_cost_advantage``, violations are divided by the standard deviations of the
+    cost advantages before they are compared. A
     :class:`~torchrl_safe.objectives.ViolationUpdater` brings the violations, once for each
     collected batch. The cost then swings about ``cost_limit + tolerance``. (The paper returns the
     policy of a randomly chosen step that maximized the reward.)

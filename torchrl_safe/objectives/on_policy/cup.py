@@ -121,7 +121,6 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
     """
 
     improved_actor_params: TensorDictParams
-    projecting: Tensor
 
     def __init__(
         self,
@@ -146,14 +145,12 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
         self.improved_actor_params = TensorDictParams(
             actor_params(self).data.clone(), no_convert=True
         )
-        self.register_buffer(
-            "projecting", torch.tensor(False, device=self.cost_critic_coeff.device)
-        )
+        self._has_started = False
+        self.register_load_state_dict_post_hook(_start)
 
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
-        self.projecting.fill_(False)
         return self.unconstrained(tensordict, advantage)
 
     def start_projection(self) -> None:
@@ -164,7 +161,7 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             self.improved_actor_params = TensorDictParams(present.clone(), no_convert=True)
         else:
             kept.update_(present)
-        self.projecting.fill_(True)
+        _start(self)
 
     def projection_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of the second phase. It trains the policy alone.
@@ -179,13 +176,12 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             divergence.
 
         Raises:
-            RuntimeError: if :meth:`start_projection` was not called since the first phase.
+            RuntimeError: if :meth:`start_projection` was never called.
             KeyError: if the data have no ``cost_advantage``.
             ValueError: if the costs have another width than ``num_costs``.
         """
-        # Not in a compiled graph, which cannot branch on a tensor.
-        if not torch.compiler.is_compiling() and not self.projecting:
-            raise RuntimeError("Call start_projection before the first projection_loss of a batch.")
+        if not self._has_started:
+            raise RuntimeError("Call start_projection before projection_loss, once in each batch.")
         tensordict = tensordict.clone(False)
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
         improved = self._improved_policy(tensordict)
@@ -217,3 +213,8 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
     def _cost_scale(self) -> Tensor:
         estimator = self.cost_value_estimator
         return (1 - estimator.gamma * estimator.lmbda) / (1 - estimator.gamma)
+
+
+def _start(loss: CUPLoss, *_: Any) -> None:
+    # Also a loss that is loaded: its improved policy comes with the state.
+    loss._has_started = True

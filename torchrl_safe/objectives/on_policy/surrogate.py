@@ -70,7 +70,10 @@ class CostSurrogate(ConstrainedPPO):
 
     @episode_length.setter
     def episode_length(self, episode_length: float | None) -> None:
-        self._episode_length = check_episode_length(episode_length)
+        length = check_episode_length(episode_length)
+        if self._cost_value_estimator is not None:
+            check_length_known(length, self._cost_value_estimator.gamma)
+        self._episode_length = length
 
     @abc.abstractmethod
     def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:

@@ -90,7 +90,7 @@ class CostUpdater(abc.ABC):
                 shape ``(E, k)``. With ``E = 0`` nothing changes.
 
         Raises:
-            TypeError: if it is no tensor, or the loss is in half precision.
+            TypeError: if it is no tensor, or multipliers are in half precision.
             ValueError: if the shape is wrong or a cost is NaN or infinite. Nothing has changed
                 then.
 
@@ -99,11 +99,6 @@ class CostUpdater(abc.ABC):
         ``set_truncated`` off: it would count parts of episodes.
         """
         buffer = getattr(self.loss_module, self.buffer_name)
-        if torch.finfo(buffer.dtype).bits < 32:
-            raise TypeError(
-                f"{self.buffer_name} must be float32 or float64, got {buffer.dtype}, which loses "
-                "small steps: keep the loss in float32 and use torch.autocast."
-            )
         if not isinstance(episode_cost, Tensor):
             raise TypeError(f"episode_cost must be a tensor, got {episode_cost!r}.")
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:

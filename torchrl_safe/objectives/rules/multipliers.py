@@ -92,6 +92,10 @@ class MultiplierUpdater(CostUpdater):
         # The largest so far, slowly forgotten.
         self.cost_scale = torch.zeros_like(self.cost_limit)
 
+    def _check_state(self, state_dict: dict[str, Any]) -> None:
+        super()._check_state(state_dict)
+        _check_bound(state_dict["max_multiplier"])
+
     @property
     def max_multiplier(self) -> float | None:
         """The largest multiplier, if there is one. You can set what the constructor takes."""
@@ -99,9 +103,7 @@ class MultiplierUpdater(CostUpdater):
 
     @max_multiplier.setter
     def max_multiplier(self, bound: float | None) -> None:
-        if bound is not None and as_number(bound) != math.inf:
-            bound = check_number("max_multiplier", bound, positive=True)
-        self._max_multiplier = bound
+        self._max_multiplier = _check_bound(bound)
 
     def _as_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> Tensor:
         limit = super()._as_limit(cost_limit)
@@ -110,6 +112,11 @@ class MultiplierUpdater(CostUpdater):
         return limit
 
     def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
+        if buffer.dtype not in (torch.float32, torch.float64):
+            raise TypeError(
+                f"{self.buffer_name} must be float32 or float64, got {buffer.dtype}, which loses "
+                "small steps: keep the loss in float32 and use torch.autocast."
+            )
         violation, cost_scale = self._violation(episode_cost), self.cost_scale
         if self.normalize:
             current, past = self._scale_of(episode_cost), cost_scale.to(episode_cost)
@@ -176,6 +183,12 @@ class MultiplierUpdater(CostUpdater):
         self.max_multiplier = state_dict["max_multiplier"]
         self.normalize = state_dict["normalize"]
         self.cost_scale = state_dict["cost_scale"].clone()
+
+
+def _check_bound(bound: float | None) -> float | None:
+    if bound is None or as_number(bound) == math.inf:
+        return bound
+    return check_number("max_multiplier", bound, positive=True)
 
 
 class DualAscent(MultiplierUpdater):
@@ -255,14 +268,16 @@ class DualAscent(MultiplierUpdater):
         self.parametrization = parametrization
         self._parameter = torch.zeros_like(multiplier)
         if not callable(optimizer):
-            raise TypeError(f"optimizer must be a class such as torch.optim.Adam, got {optimizer}.")
+            raise TypeError(
+                f"optimizer must be a class such as torch.optim.Adam, got {optimizer!r}."
+            )
         self.optimizer = optimizer([self._parameter], lr=lr)
 
     def _move(self, buffer: Tensor, episode_cost: Tensor) -> None:
         before = copy.deepcopy(self.optimizer.state_dict())
         try:
             super()._move(buffer, episode_cost)
-        except ValueError:
+        except Exception:
             self.optimizer.load_state_dict(before)
             raise
 

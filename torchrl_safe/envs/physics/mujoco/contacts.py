@@ -96,7 +96,7 @@ def _set(geom: Any, kind: int, others: int) -> None:
 
 
 def exclude_overlaps(spec: Any, arm: set[str], model: Any, states: Iterable[Any]) -> None:
-    """Excludes collisions of neighbouring links, and of links that touch each other by design.
+    """Excludes collisions of neighbouring links, and of links that touch in one of some states.
 
     The collision shapes of neighbours overlap. MuJoCo does not test parents against children,
     unless the parent does not move.
