@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import GymEnv, ParallelEnv, RewardSum, SerialEnv, TransformedEnv
+from torchrl.envs import ParallelEnv, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
@@ -139,30 +139,6 @@ def resumable(device="cpu"):
         total_frames=-1,
         auto_register_policy_transforms=False,
     )
-
-
-def test_resuming_where_episodes_begin_anew_warns():
-    """Most environments have no get_extra_state."""
-
-    def make():
-        env = GymEnv("Pendulum-v1")
-        policy = TensorDictModule(torch.nn.Linear(3, 1), ["observation"], ["action"])
-        return ResumableCollector(
-            env,
-            policy,
-            frames_per_batch=4,
-            total_frames=-1,
-            auto_register_policy_transforms=False,
-        )
-
-    one, other = make(), make()
-    try:
-        next(iter(one))
-        with pytest.warns(UserWarning, match="Episodes begin anew, so the run differs"):
-            other.load_state_dict(one.state_dict())
-    finally:
-        one.shutdown()
-        other.shutdown()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

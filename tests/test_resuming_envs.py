@@ -340,7 +340,8 @@ def test_environments_without_a_state_begin_anew(make):
     one, two = collector(), collector()
     try:
         next(iter(one))
-        two.load_state_dict(one.state_dict())
+        with pytest.warns(UserWarning, match="Episodes begin anew, so the run differs"):
+            two.load_state_dict(one.state_dict())
         batch = next(iter(two)).reshape(-1, 10 // (1 if make is pendulum else 2))
         sums, rewards = batch["next", "episode_reward"], batch["next", "reward"]
         torch.testing.assert_close(sums[:, 0], rewards[:, 0])
@@ -360,7 +361,8 @@ def test_whole_trajectories_begin_anew():
 
     one, two = collector(), collector()
     next(iter(one))
-    two.load_state_dict(one.state_dict())
+    with pytest.warns(UserWarning, match="Episodes begin anew, so the run differs"):
+        two.load_state_dict(one.state_dict())
     batch = next(iter(two))
     assert not batch["step_count"][:, 0].any()
     assert (batch["collector", "mask"].sum(-1) == 7).all()

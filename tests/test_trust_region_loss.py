@@ -158,7 +158,6 @@ def test_keys_can_be_nested():
 
 def test_call_with_keywords_equals_call_with_tensordict():
     loss, batch = make_loss(2), make_batch(2)
-    batch = batch.reshape(-1)
     keywords = {
         "_".join(key) if isinstance(key, tuple) else key: batch[key] for key in loss.in_keys
     }
