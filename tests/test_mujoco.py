@@ -387,6 +387,28 @@ def test_threads_are_the_cores_that_are_ours(monkeypatch):
             MuJoCo(threads=threads)
 
 
+FORGET = """
+import gc, os, signal
+from torchrl_safe.envs import ArmEnv, MuJoCo
+
+env = ArmEnv(num_envs=2, physics=MuJoCo(threads=2), seed=0)
+env.rollout(2)
+if os.fork() == 0:
+    signal.alarm(20)
+    del env
+    gc.collect()
+    os._exit(0)
+_, status = os.wait()
+assert status == 0, status
+"""
+
+
+def test_a_forked_process_can_forget_an_environment():
+    """The threads of its worlds stay behind, and freeing them would wait for these for ever."""
+    result = run_code(FORGET)
+    assert result.returncode == 0, result.stderr
+
+
 def test_there_is_no_window(make_env):
     with pytest.raises(ValueError, match="gui must be False with MuJoCo"):
         ArmEnv(physics=ONE, gui=True)

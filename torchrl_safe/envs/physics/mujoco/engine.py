@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from weakref import WeakSet
 
 try:
     import mujoco
@@ -23,7 +26,27 @@ except (ImportError, AttributeError) as _error:
 
     mujoco = batch = _Missing()
 
-__all__ = ["batch", "mujoco", "quiet"]
+__all__ = ["make_batch", "mujoco", "quiet"]
+
+# A forked process has the batches of its parent, but not their threads, and freeing a batch waits
+# for these for ever (MuJoCo 4.0): there, they are kept to the end.
+_made: WeakSet[Any] = WeakSet()
+_inherited: list[Any] = []
+if sys.platform != "win32":
+    os.register_at_fork(after_in_child=lambda: _inherited.extend(_made))
+
+
+def make_batch(model: Any, num_envs: int, threads: int) -> Any:
+    """Makes a ``mujoco.batch.Batch`` that a forked process can forget.
+
+    Args:
+        model: the model of every world.
+        num_envs: number of worlds.
+        threads: threads that they are shared between.
+    """
+    made = batch.Batch(model, num_envs, min(threads, num_envs))
+    _made.add(made)
+    return made
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.arm import name_solids, read_arm
 from torchrl_safe.envs.physics.mujoco.bodies import TABLE, add_obstacle, obstacle
 from torchrl_safe.envs.physics.mujoco.contacts import level_bodies
-from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
+from torchrl_safe.envs.physics.mujoco.engine import make_batch, mujoco, quiet
 from torchrl_safe.envs.physics.scene import Scene
 from torchrl_safe.envs.physics.screws import distance_jacobian
 from torchrl_safe.envs.physics.simulator import Nearest
@@ -102,7 +102,7 @@ class Ruler:
         self._geom, self._moves = geoms, moves[model.geom_bodyid[geoms]]
         self._joints, self._slides = joints, model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         self._position = model.jnt_qposadr[joints]
-        self._batch = batch.Batch(model, num_envs, min(threads, num_envs))
+        self._batch = make_batch(model, num_envs, threads)
         bind = self._batch.bind
         self._qpos, self._place, self._turn = map(bind, ("qpos", "mocap_pos", "mocap_quat"))
         self._axes, self._anchors, self._centres = map(bind, ("xaxis", "xanchor", "geom_xpos"))

@@ -14,7 +14,7 @@ from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.bodies import obstacle, thing
 from torchrl_safe.envs.physics.mujoco.chain import Chain, ToolPose
 from torchrl_safe.envs.physics.mujoco.clearance import Clearance
-from torchrl_safe.envs.physics.mujoco.engine import batch, mujoco, quiet
+from torchrl_safe.envs.physics.mujoco.engine import make_batch, mujoco, quiet
 from torchrl_safe.envs.physics.mujoco.free import FreeBodies
 from torchrl_safe.envs.physics.mujoco.model import build_scenery, build_world
 from torchrl_safe.envs.physics.mujoco.motors import FINGER_GROUP, fill_controls
@@ -64,7 +64,7 @@ class MuJoCoSimulator:
         model, parts = world.model, world.parts
         self._build = (arm, scene, shapes, objects)
         self._frame_skip, self._sensing, self._places = frame_skip, sensing, world.places
-        self._batch = batch.Batch(model, num_envs, min(threads, num_envs))
+        self._batch = make_batch(model, num_envs, threads)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._mocap_pos, self._mocap_quat = (
             self._batch.bind(name) for name in ("mocap_pos", "mocap_quat")
