@@ -26,7 +26,7 @@ from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 from tqdm import tqdm
 
 from experiments.algorithms import ALGORITHMS, Training, configured, own_settings
-from experiments.config import AlgorithmName, Config, command_line
+from experiments.config import TASKS, AlgorithmName, Config, command_line
 from experiments.demonstrations import CARE, start_from_demonstrations
 from experiments.files import as_json, lasting, run_to_resume, write_whole
 from experiments.film import Policy, save_film
@@ -64,7 +64,6 @@ from torchrl_safe.policy import load_policy, save_policy
 
 # What options are called in the names that Gymnasium knows.
 ARMS = {name.lower(): name for name in gym.ARMS}
-TASKS = {"reach": "Reach", "push": "Push", "pick-and-place": "PickAndPlace"}
 OBSTACLES = {
     "none": "",
     "in-front": "InFront",
@@ -134,9 +133,9 @@ def arm_arguments(config: Config, shielded: bool = True) -> dict[str, Any]:
     """What the arm, its task and its costs are, as arguments of ArmEnv."""
     if config.suite_task is not None:
         return SUITE[config.suite_task].arguments
-    arm, task, obstacles = ARMS[config.arm], TASKS[config.task], OBSTACLES[config.obstacles]
+    task = TASKS[config.task].__name__
     return {
-        **gym.combination(arm, task, obstacles, action=""),
+        **gym.combination(ARMS[config.arm], task, OBSTACLES[config.obstacles], action=""),
         "action": make_action(config),
         "costs": {name: COSTS[name] for name in cost_names(config, shielded)},
     }

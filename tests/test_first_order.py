@@ -233,7 +233,7 @@ def test_cup_projects_by_hand(functional):
     train(loss, data, 3)
     improved = copy.deepcopy(loss)
     loss.start_projection()
-    shift(loss)
+    train(loss, data, 3)
     losses = loss.projection_loss(data)
 
     def evaluate(some):
@@ -272,7 +272,7 @@ def test_cup_projection_leads_back_to_the_improved_policy():
     data = estimated(loss, 2)
     loss.start_projection()
     assert loss.projection_loss(data)["kl"] == 0.0
-    shift(loss)
+    train(loss, data, 10)
     moved = loss.projection_loss(data)["kl"]
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
     for _ in range(100):  # Multiplier zero: nothing but the divergence is left to minimize.
@@ -622,10 +622,9 @@ def test_a_masked_action_leaves_the_gradients_finite(make, distribution, width):
         actor(batch)
     phases = [loss]
     if make is CUPLoss:
+        loss.start_projection()
         phases.append(loss.projection_loss)
     for phase in phases:
-        if phase is not loss:
-            loss.start_projection()
         losses = phase(batch)
         sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())

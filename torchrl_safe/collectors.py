@@ -84,13 +84,6 @@ class ResumableCollector(Collector):
         for n, level in enumerate(around):
             if f"inner_env_{n}" in state_dict:
                 level.load_state_dict(state_dict[f"inner_env_{n}"])
-        if "torch_generator" in state_dict and "carrier" not in state_dict:
-            warnings.warn(
-                "Episodes begin anew, so the run differs from one that was not stopped. Only those "
-                "of environments with get_extra_state go on, and not in a ParallelEnv or with "
-                "trajs_per_batch.",
-                stacklevel=2,
-            )
         if "carrier" in state_dict:
             env.load_state_dict(state_dict["base_env_state_dict"])
             if "traj_pool" in state_dict:  # The pool of workers is in the state of their parent.
@@ -101,6 +94,13 @@ class ResumableCollector(Collector):
                 batch_size=self._carrier.batch_size,
                 device=self._carrier.device,
             ).clone()
+        elif "torch_generator" in state_dict:  # Not in the state of a Collector.
+            warnings.warn(
+                "Episodes begin anew, so the run differs from one that was not stopped. Only those "
+                "of environments with get_extra_state go on, and not in a ParallelEnv or with "
+                "trajs_per_batch.",
+                stacklevel=2,
+            )
         if "torch_generator" in state_dict:
             torch.set_rng_state(state_dict["torch_generator"].cpu())
         if "cuda_generators" in state_dict:

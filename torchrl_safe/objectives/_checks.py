@@ -40,11 +40,11 @@ def check_number(name: str, value: Any, *, positive: bool = False) -> float:
 
 def coefficients(name: str, value: Any, num_costs: int, *, positive: bool = False) -> Tensor:
     """One number, shape ``()``, or one for each cost, ``(k,)``; see :func:`check_number`."""
-    if as_tensor(name, value, torch.get_default_dtype()).ndim == 0:
-        return torch.tensor(check_number(name, value, positive=positive))
-    numbers = [check_number(name, number, positive=positive) for number in value]
-    check_one_each(name, torch.tensor(numbers), num_costs)
-    return torch.tensor(numbers)
+    numbers = as_tensor(name, value, torch.get_default_dtype())
+    check_one_each(name, numbers, num_costs)
+    for number in value if numbers.ndim else [value]:
+        check_number(name, number, positive=positive)
+    return numbers.clone()
 
 
 def check_share(name: str, value: Any) -> float:
@@ -83,7 +83,7 @@ def check_length_known(episode_length: float | None, gamma: Tensor) -> None:
 def as_number(value: Any) -> float:
     """The value of a number or of a tensor with one element, NaN of anything else."""
     if isinstance(value, Tensor):
-        return float(value) if value.numel() == 1 and not value.is_complex() else math.nan
+        return float(value.detach()) if value.numel() == 1 and not value.is_complex() else math.nan
     try:
         return float(value) if isinstance(value, Real) else math.nan
     except OverflowError:
@@ -92,15 +92,7 @@ def as_number(value: Any) -> float:
 
 def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:
     """The multipliers to start with, shape ``(k,)``, checked."""
-    multiplier = as_tensor("multiplier_init", multiplier_init, torch.get_default_dtype())
-    check_one_each("multiplier_init", multiplier, num_costs)
-    # Near the end of single precision its product with an advantage would be infinite.
-    if not ((multiplier >= 0) & (multiplier <= 1e18)).all():
-        raise ValueError(
-            "multiplier_init must be finite and not negative, and at most 1e18, got "
-            f"{multiplier_init}."
-        )
-    return multiplier.expand(num_costs).clone()
+    return coefficients("multiplier_init", multiplier_init, num_costs).expand(num_costs).clone()
 
 
 def get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:

@@ -191,8 +191,7 @@ def check_num_costs(
         for key in list(alone.keys(True, True)):
             if (key if isinstance(key, str) else key[-1]).startswith("cost"):
                 alone[key] = alone[key][..., index : index + 1]
-        strength = torch.zeros(num_costs)
-        strength[index] = 0.7
+        strength = 0.7 * torch.eye(num_costs)[index]
         gradients = [
             _policy_gradient(make_loss, make_networks, constrain, each, values)[1]
             for each, values in ((data, strength), (alone, strength[index : index + 1]))
@@ -253,8 +252,7 @@ def check_multiplier_direction(
         uphill = _gradient(surrogate[index], [*actor.parameters()])
         cosines = []
         for size in (0.0, 100.0):
-            strength = torch.zeros(num_costs)
-            strength[index] = size
+            strength = size * torch.eye(num_costs)[index]
             loss, gradient = _policy_gradient(make_loss, make_networks, constrain, data, strength)
             cosines.append(torch.cosine_similarity(gradient, uphill, dim=0).item())
         require(
@@ -314,9 +312,7 @@ def check_q_multiplier_direction(
         )
     uphill = [_gradient(action[index], parameters) for index in range(num_costs)]
     for index in range(num_costs):
-        strength = torch.zeros(num_costs)
-        strength[index] = 100.0
-        constrain(loss, strength)
+        constrain(loss, 100.0 * torch.eye(num_costs)[index])
         downhill = _gradient(total(call(loss, data)), parameters)
         cosines = [torch.cosine_similarity(downhill, each, dim=0).item() for each in uphill]
         require(
