@@ -12,11 +12,11 @@ import torch
 from hypothesis import HealthCheck, given, settings, strategies as st
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
-from torchrl.objectives import ClipPPOLoss, LossModule
+from torchrl.objectives import ClipPPOLoss, LossModule, SoftUpdate
 
 from torchrl_safe import envs, metrics, objectives
 from torchrl_safe.envs import ArmEnv
-from torchrl_safe.testing import make_batch, make_networks
+from torchrl_safe.testing import make_batch, make_networks, make_q_networks, make_transitions
 
 # ---------------------------------------------------------------- values
 
@@ -238,7 +238,7 @@ def test_actions(examples, arm):
 
 OURS = {
     "num_costs", "multiplier_init", "cost_critic_coeff", "temperature", "kl_bound",
-    "penalty_coeff", "sharpness", "tolerance", "separate_losses",
+    "penalty_coeff", "sharpness", "tolerance", "separate_losses", "episode_length",
 }  # fmt: skip
 
 
@@ -286,6 +286,32 @@ def test_losses(call):
         return
     losses = loss(loss.estimate_advantages(batch).reshape(-1))
     for key, value in losses.items():
+        assert value.isfinite().all() or not key.startswith("loss_"), key
+
+
+def of_q_networks(kind, **options):
+    def make(**chosen):
+        deterministic = kind is objectives.TD3LagrangianLoss
+        loss = kind(*make_q_networks(deterministic=deterministic), **options, **chosen)
+        SoftUpdate(loss, tau=0.5)
+        return loss
+
+    return named(make, kind)
+
+
+Q_LOSSES = [
+    of_q_networks(objectives.SACLagrangianLoss, target_entropy=-2.0),
+    of_q_networks(objectives.TD3LagrangianLoss, bounds=(-1.0, 1.0)),
+]
+
+
+@fuzz(calls(*Q_LOSSES, only={"num_cost_qvalue_nets", "multiplier_init"}), few=40, many=2_000)
+def test_q_losses(call):
+    """An off-policy loss that can be made gives finite losses."""
+    loss = attempt(*call)
+    if loss is None:
+        return
+    for key, value in loss(make_transitions()).items():
         assert value.isfinite().all() or not key.startswith("loss_"), key
 
 
