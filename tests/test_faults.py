@@ -10,6 +10,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
+import pybullet
 import pytest
 import torch
 from tensordict import TensorDict
@@ -23,7 +24,7 @@ from experiments.algorithms import ALGORITHMS
 from experiments.config import Config
 from experiments.train import make_env, train
 from torchrl_safe import envs
-from torchrl_safe.envs import ArmEnv, Collision, FullObservation, InFront, Placement, Reach
+from torchrl_safe.envs import ArmEnv, Collision, FullObservation, InFront, Placement, Reach, Shield
 from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss
 
 ROOT = Path(__file__).parent.parent
@@ -216,6 +217,21 @@ def test_the_arm_refuses_nan(settings, message, make_env):
     with pytest.raises(ValueError, match=message):
         env.rollout(3)
     assert env.reset()["observation"].isfinite().all()
+
+
+@pytest.mark.parametrize("before", [0, 1])
+def test_a_process_that_holds_as_many_servers_as_pybullet_can(before, monkeypatch):
+    """PyBullet answers -1, whether a world or what a shield measures in is one too many."""
+    connect, opened = pybullet.connect, []
+
+    def limited(mode):
+        opened.append(connect(mode) if len(opened) < before else -1)
+        return opened[-1]
+
+    monkeypatch.setattr(pybullet, "connect", limited)
+    with pytest.raises(RuntimeError, match="PyBullet opened no world"):
+        ArmEnv(shield=Shield())
+    assert len(opened) == before + 1
 
 
 def test_a_nan_action_is_refused_before_anything_moves(make_env):

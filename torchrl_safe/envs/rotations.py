@@ -1,4 +1,4 @@
-"""Quaternions (x, y, z, w), one or many: the last axis holds the four numbers."""
+"""Quaternions (x, y, z, w) and vectors, one or many: the last axis holds their numbers."""
 
 from __future__ import annotations
 
@@ -76,7 +76,22 @@ def from_z_axis(axis: Array) -> Array:
         np.float64(1.0)
     """
     x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
-    turn = np.stack([-y, x, np.zeros_like(x), 1 + z], axis=-1)
-    length = np.linalg.norm(turn, axis=-1, keepdims=True)
+    half = np.stack([-y, x, np.zeros_like(x), 1 + z], axis=-1)
+    length = np.linalg.norm(half, axis=-1, keepdims=True)
     # Straight down the axis of the half turn is free: x is taken.
-    return np.where(length < 1e-9, (1.0, 0.0, 0.0, 0.0), turn / np.maximum(length, 1e-9))
+    return np.where(length < 1e-9, (1.0, 0.0, 0.0, 0.0), half / np.maximum(length, 1e-9))
+
+
+def cross(first: Array, second: Array) -> Array:
+    """Returns cross products, ``(..., 3)``: for few vectors several times as fast as NumPy's."""
+    x, y, z = first[..., 0], first[..., 1], first[..., 2]
+    other_x, other_y, other_z = second[..., 0], second[..., 1], second[..., 2]
+    return np.stack(
+        [y * other_z - z * other_y, z * other_x - x * other_z, x * other_y - y * other_x], axis=-1
+    )
+
+
+def turn(orientation: Array, vector: Array) -> Array:
+    """Returns vectors ``(..., 3)`` turned by quaternions (x, y, z, w), ``(..., 4)``."""
+    axis, twice = orientation[..., :3], 2 * cross(orientation[..., :3], vector)
+    return vector + orientation[..., 3:] * twice + cross(axis, twice)

@@ -5,9 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchrl_safe._checks import check_flag, check_not_negative, check_positive, keep_numbers
+from torchrl_safe.envs.obstacles.shapes import Box
 
 #: Duration of one physics substep, s.
 SUBSTEP = 1 / 240
+#: The table, whose top is at height 0, and its centre, m.
+TABLE_SHAPE = Box(half_extents=(0.75, 0.6, 0.025))
+TABLE_CENTRE = (0.5, 0.0, -0.025)
+#: Height of the floor, which is only drawn, and half its width, m.
+FLOOR_HEIGHT, FLOOR_SIZE = -0.7, 10.0
+#: Distance up to which the clearance at the start of an episode is measured, m.
+FARTHEST = 0.1
 
 
 @dataclass(frozen=True)

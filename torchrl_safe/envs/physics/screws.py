@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_safe.envs.rotations import cross
 from torchrl_safe.envs.state import Array
-from torchrl_safe.envs.vectors import cross
 
 
 def distance_jacobian(
@@ -36,3 +38,21 @@ def distance_jacobian(
         slides = slides[:, None]
         turning, moving = np.where(slides, 0.0, axis), np.where(slides, axis, moving)
     return lines @ np.concatenate([turning, moving], axis=2).transpose(0, 2, 1)
+
+
+def moves(parents: Sequence[int], links: Sequence[int]) -> NDArray[np.bool_]:
+    """Returns which joints move which links, ``(links, joints)``.
+
+    Args:
+        parents: number of each link's parent, before its children; another for a root.
+        links: number of the link that each joint moves.
+
+    Examples:
+        >>> moves([-1, 0, 0], [0, 2]).tolist()
+        [[True, False], [True, False], [True, True]]
+    """
+    found = np.asarray(links) == np.arange(len(parents))[:, None]
+    for link, parent in enumerate(parents):
+        if 0 <= parent < link:
+            found[link] |= found[parent]
+    return found

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torchrl_safe._checks import check_kind, check_not_negative, check_positive
 from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.regions import Region
+from torchrl_safe.envs.rotations import cross
 from torchrl_safe.envs.shield.projection import project
 from torchrl_safe.envs.state import ArmState, Array
-from torchrl_safe.envs.vectors import cross
 
 # At the end of a control step another point of a shape may be the nearest, and points move on
 # curves. For each radian that the joints turn, a distance can be off by this much, m.

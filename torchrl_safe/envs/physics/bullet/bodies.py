@@ -25,7 +25,13 @@ from torchrl_safe.envs.physics.palette import (
     colour,
     ring,
 )
-from torchrl_safe.envs.physics.scene import Scene
+from torchrl_safe.envs.physics.scene import (
+    FLOOR_HEIGHT,
+    FLOOR_SIZE,
+    TABLE_CENTRE,
+    TABLE_SHAPE,
+    Scene,
+)
 from torchrl_safe.envs.state import Array
 
 _UNLIMITED_EFFORT = 1e5
@@ -190,10 +196,10 @@ def load_furniture(
     """Loads URDF files of ``pybullet_data``, or if there are none a table with top at height 0."""
     if furniture:
         return [load_body(client, urdf, position, fixed=True) for urdf, position in furniture]
-    table = Box(half_extents=(0.75, 0.6, 0.025))
-    body = add_shape(client, table, (0.5, 0, -0.025), TABLE if visuals else None)
+    body = add_shape(client, TABLE_SHAPE, TABLE_CENTRE, TABLE if visuals else None)
     if visuals:
-        floor = _skin(client, [Part(Box(half_extents=(10, 10, 0.01)), (0, 0, -0.71))], FLOOR)
+        thin = Box(half_extents=(FLOOR_SIZE, FLOOR_SIZE, 0.01))
+        floor = _skin(client, [Part(thin, (0, 0, FLOOR_HEIGHT - 0.01))], FLOOR)
         pybullet.createMultiBody(0, -1, floor, physicsClientId=client)
     return [body]
 

@@ -18,4 +18,18 @@ except ImportError:
 
     pybullet = pybullet_data = _Missing()
 
-__all__ = ["pybullet", "pybullet_data"]
+__all__ = ["connect", "pybullet", "pybullet_data"]
+
+
+def connect(*, gui: bool = False) -> int:
+    """Opens a server of PyBullet and returns its number.
+
+    Raises:
+        RuntimeError: if the process holds as many as it can.
+    """
+    client: int = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
+    if client < 0:
+        raise RuntimeError(
+            "PyBullet opened no world: a process can hold 1024, one of them with a window."
+        )
+    return client

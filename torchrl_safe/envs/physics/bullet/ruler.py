@@ -9,18 +9,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
-from torchrl_safe.envs.physics.bullet.bodies import LoadedArm, add_shape, load_arm, load_furniture
-from torchrl_safe.envs.physics.bullet.engine import pybullet
+from torchrl_safe.envs.physics.bullet.bodies import add_shape, load_arm, load_furniture
+from torchrl_safe.envs.physics.bullet.engine import connect, pybullet
 from torchrl_safe.envs.physics.paths import limbo
 from torchrl_safe.envs.physics.scene import Scene
-from torchrl_safe.envs.physics.screws import distance_jacobian
+from torchrl_safe.envs.physics.screws import distance_jacobian, moves
 from torchrl_safe.envs.physics.simulator import Nearest
+from torchrl_safe.envs.rotations import turn
 from torchrl_safe.envs.state import Array
-from torchrl_safe.envs.vectors import turn
 
 if TYPE_CHECKING:
     from torchrl_safe.envs.physics.bullet.physics import Bullet
@@ -51,7 +50,7 @@ class Ruler:
         merge: bool,
         reach: float,
     ) -> None:
-        self._client = client = pybullet.connect(pybullet.DIRECT)
+        self._client = client = connect()
         self.close = weakref.finalize(self, pybullet.disconnect, client)
         self._reach = reach
         self._arm = load_arm(
@@ -82,7 +81,7 @@ class Ruler:
         ]
         self._slides = np.array([infos[j][2] == pybullet.JOINT_PRISMATIC for j in self._driven])
         self._axis = np.array([infos[joint][13] for joint in self._driven])
-        self._moves = _moves(self._arm, self._driven, [info[16] for info in infos])
+        self._moves = moves([info[16] for info in infos], self._driven)
         moving = {link for link in range(len(infos)) if self._moves[link].any()}
         rising = {link for link in moving if not self._is_level(link)}
         #: Bodies that are measured against the arm, and the links that count there.
@@ -142,14 +141,3 @@ class Ruler:
         jacobian = distance_jacobian(point, normal, anchor, axis, self._slides)
         jacobian *= self._moves[links]
         return Nearest(distance, normal, point, jacobian, self._other)
-
-
-def _moves(arm: LoadedArm, joints: Sequence[int], parents: Sequence[int]) -> NDArray[np.bool_]:
-    """Which joints move which links, ``(links, joints)``."""
-    moves = np.zeros((len(parents), len(joints)), dtype=bool)
-    for link, parent in enumerate(parents):
-        if parent >= 0:
-            moves[link] = moves[parent]
-        if link in joints:
-            moves[link, joints.index(link)] = True
-    return moves

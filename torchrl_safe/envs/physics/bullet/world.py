@@ -7,7 +7,7 @@ import os
 import sys
 import weakref
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,11 @@ from torchrl_safe.envs.physics.bullet.bodies import (
     load_furniture,
     scale_dynamics,
 )
-from torchrl_safe.envs.physics.bullet.engine import pybullet
+from torchrl_safe.envs.physics.bullet.engine import connect, pybullet
 from torchrl_safe.envs.physics.bullet.readings import MovingBody, Readings, Vector, link_state
 from torchrl_safe.envs.physics.palette import OBJECT, OBSTACLE, TOUCHED, colour
 from torchrl_safe.envs.physics.paths import WIDTHS, Ways, limbo, look_ahead
-from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
+from torchrl_safe.envs.physics.scene import FARTHEST, SUBSTEP, Camera, Scene
 from torchrl_safe.envs.rotations import UPRIGHT
 from torchrl_safe.envs.state import Array, Sensing
 
@@ -71,11 +71,7 @@ class World:
         if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):
             # PyBullet would end the process, and the training with it.
             raise RuntimeError("gui needs a screen, but DISPLAY is not set: make a video instead.")
-        self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        if self._client < 0:
-            raise RuntimeError(
-                "PyBullet opened no world: a process can hold 1024, one of them with a window."
-            )
+        self._client = connect(gui=gui)
         # PyBullet reuses client numbers: each is disconnected once, by its owner.
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
         self._scene, self._options = scene, options
@@ -276,7 +272,8 @@ class World:
     def _drive(self, targets: Vector, remaining: int) -> None:
         """Tells the motors how to get to their targets in the remaining substeps."""
         count, gain = len(targets), self._options.motor_gain
-        driven, options = self._driven[:count], {"physicsClientId": self._client}
+        driven = self._driven[:count]
+        options: dict[str, Any] = {"physicsClientId": self._client}
         if self._scene.motor_limits:
             options["forces"] = self._efforts[:count]
         if gain is not None:
@@ -388,10 +385,10 @@ class World:
             for index in self._present
             for body in (self._arm.body, *self._objects)
             for point in pybullet.getClosestPoints(
-                body, self._obstacles[index], 0.1, physicsClientId=self._client
+                body, self._obstacles[index], FARTHEST, physicsClientId=self._client
             )
         ]
-        return min(points, default=0.1)
+        return min(points, default=FARTHEST)
 
     def tool_at(self, joint_position: Vector) -> tuple[Vector, Vector]:
         """Moves the arm at once; returns tool point and orientation. To be reset afterwards."""

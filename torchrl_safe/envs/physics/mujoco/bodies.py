@@ -18,11 +18,10 @@ from torchrl_safe.envs.physics.palette import (
     Colour,
     colour,
 )
+from torchrl_safe.envs.physics.scene import TABLE_CENTRE, TABLE_SHAPE
 
 #: Name of the table's shape; its top is at height 0.
 TABLE = "table"
-_TABLE = Box(half_extents=(0.75, 0.6, 0.025))
-_TABLE_PLACE = (0.5, 0.0, -0.025)
 
 
 def obstacle(index: int) -> str:
@@ -38,7 +37,7 @@ def thing(index: int) -> str:
 def add_table(spec: Any, *, reach: float) -> None:
     """Adds the table: a box, so that what falls off its edge keeps falling."""
     _add_geom(
-        spec.worldbody, TABLE, _TABLE, TABLE_COLOUR, free=False, reach=reach, pos=_TABLE_PLACE
+        spec.worldbody, TABLE, TABLE_SHAPE, TABLE_COLOUR, free=False, reach=reach, pos=TABLE_CENTRE
     )
 
 

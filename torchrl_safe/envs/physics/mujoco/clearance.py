@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
+from torchrl_safe.envs.physics.scene import FARTHEST
 from torchrl_safe.envs.state import Array
-
-_FARTHEST = 0.1
 
 
 class Clearance:
@@ -38,7 +37,7 @@ class Clearance:
         model, data = self._model, self._data
         mujoco.mj_setState(model, data, state, int(mujoco.mjtState.mjSTATE_INTEGRATION))
         mujoco.mj_kinematics(model, data)
-        nearest = _FARTHEST
+        nearest = FARTHEST
         for shape in self._obstacles[present]:
             apart = np.linalg.norm(data.geom_xpos[self._others] - data.geom_xpos[shape], axis=1)
             radii = model.geom_rbound[self._others] + model.geom_rbound[shape]

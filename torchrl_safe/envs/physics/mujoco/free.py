@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from torchrl_safe.envs.physics.mujoco.quaternions import FROM_MUJOCO, TO_MUJOCO
 from torchrl_safe.envs.physics.paths import Ways
+from torchrl_safe.envs.rotations import turn
 from torchrl_safe.envs.state import Array
-from torchrl_safe.envs.vectors import turn
 
 Indices = NDArray[np.int_]
 

@@ -13,8 +13,8 @@ from torchrl_safe.envs.physics.mujoco.bodies import TABLE, obstacle
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.physics.rows import places
+from torchrl_safe.envs.rotations import cross
 from torchrl_safe.envs.state import Array, Sensing
-from torchrl_safe.envs.vectors import cross
 
 #: Distance from which on contacts are found, m; forces begin at a touch.
 CONTACT_RANGE = 0.02

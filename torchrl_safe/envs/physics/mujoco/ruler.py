@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from torchrl_safe.envs.physics.mujoco.bodies import TABLE, add_obstacle, obstacl
 from torchrl_safe.envs.physics.mujoco.contacts import level_bodies
 from torchrl_safe.envs.physics.mujoco.engine import make_batch, mujoco, quiet
 from torchrl_safe.envs.physics.scene import Scene
-from torchrl_safe.envs.physics.screws import distance_jacobian
+from torchrl_safe.envs.physics.screws import distance_jacobian, moves
 from torchrl_safe.envs.physics.simulator import Nearest
 from torchrl_safe.envs.state import Array
 
@@ -74,7 +73,7 @@ class Ruler:
             geom.contype, geom.conaffinity = 1, 0
         model = spec.compile()
         joints = [model.joint(name).id for name in parts.joints + parts.fingers]
-        moves = _moves(model)[:, joints]
+        moved = moves(model.body_parentid, model.jnt_bodyid[joints])
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         level = level_bodies(model, data)
@@ -85,7 +84,7 @@ class Ruler:
             (name, thing)
             for thing in things
             for name in names
-            if moves[body[name]].any() and not (thing == TABLE and body[name] in level)
+            if moved[body[name]].any() and not (thing == TABLE and body[name] in level)
         ]
         for name, thing in pairs:
             spec.add_sensor(
@@ -99,7 +98,7 @@ class Ruler:
         model = spec.compile()
         self._thing = np.array([things.index(thing) for _, thing in pairs], dtype=int)
         geoms = np.array([model.geom(name).id for name, _ in pairs], dtype=int)
-        self._geom, self._moves = geoms, moves[model.geom_bodyid[geoms]]
+        self._geom, self._moves = geoms, moved[model.geom_bodyid[geoms]]
         self._joints, self._slides = joints, model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         self._position = model.jnt_qposadr[joints]
         self._batch = make_batch(model, num_envs, threads)
@@ -143,12 +142,3 @@ class Ruler:
         anchor, axis = self._anchors[worlds, self._joints], self._axes[worlds, self._joints]
         jacobian = distance_jacobian(point, normal, anchor, axis, self._slides) * self._moves
         return Nearest(np.where(found, distance, np.inf), normal, point, jacobian, self._thing)
-
-
-def _moves(model: Any) -> NDArray[np.bool_]:
-    """Which joints move which bodies, ``(bodies, joints)``."""
-    moves = np.zeros((model.nbody, model.njnt), dtype=bool)
-    for body in range(1, len(moves)):
-        moves[body] = moves[model.body_parentid[body]]
-        moves[body, np.flatnonzero(model.jnt_bodyid == body)] = True
-    return moves

@@ -14,6 +14,7 @@ from torchrl_safe.envs.physics.palette import (
     SKY,
     ring,
 )
+from torchrl_safe.envs.physics.scene import FLOOR_HEIGHT, FLOOR_SIZE
 
 #: Name of the ball where the goal is, which comes after all other bodies.
 GOAL = "goal"
@@ -45,7 +46,11 @@ def add_scenery(spec: Any) -> None:
     )
     unseen = {"contype": 0, "conaffinity": 0}
     spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(10, 10, 1), pos=(0, 0, -0.7), rgba=FLOOR, **unseen
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(FLOOR_SIZE, FLOOR_SIZE, 1),
+        pos=(0, 0, FLOOR_HEIGHT),
+        rgba=FLOOR,
+        **unseen,
     )
     spec.worldbody.add_light(
         pos=(1.5, -1.5, 3),
