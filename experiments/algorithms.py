@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -87,7 +88,8 @@ def keep_multiplier(loss: LossModule, config: Config) -> None:
 
 
 def move_multiplier(loss: LossModule, config: Config) -> Updater | None:
-    """The multiplier rule that was chosen."""
+    """The multiplier rule that was chosen, and the multiplier that it starts with."""
+    loss.lagrange_multiplier.fill_(config.multiplier_init)
     if config.multiplier_rule == "fixed":
         return None
     return MULTIPLIER_RULES[config.multiplier_rule](
@@ -115,18 +117,13 @@ def no_transforms(config: Config) -> list[Transform]:
 
 
 @dataclass(frozen=True)
-class OnPolicy:
-    """An algorithm that learns from each batch while it is fresh.
+class Algorithm(ABC):
+    """What each algorithm has.
 
     Args:
-        loss: called as ``loss(actor, critic, cost_critic, num_costs=)``.
+        loss: called as ``loss(actor, critic, cost_critic, num_costs=)``; off policy also with
+            ``action_spec=``.
         updater: called as ``updater(loss, config)``.
-        epochs: passes over a batch, if not those of the configuration.
-        method: the step that a trust-region method takes with the actor.
-        projects: whether each batch has a second phase, CUP's projection.
-        max_kl: how far the policy may move in a phase, in nats, before it ends.
-        compiles: whether the loss is compiled in long runs. (Losses that ask PyTorch for the
-            divergence of two distributions do not compile to one graph.)
         transforms: called as ``transforms(config)``, what is appended to the environment.
         training_transforms: the same, but not when the policy is evaluated.
         shield: filters the actions, if given.
@@ -135,18 +132,36 @@ class OnPolicy:
 
     loss: Callable[..., LossModule]
     updater: Callable[[LossModule, Config], Updater | None] = move_multiplier
-    epochs: int | None = None
-    method: TrustRegionMethod | None = None
-    projects: bool = False
-    max_kl: float = math.inf
-    compiles: bool = False
     transforms: Callable[[Config], list[Transform]] = no_transforms
     training_transforms: Callable[[Config], list[Transform]] = no_transforms
     shield: Shield | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
 
+    @abstractmethod
     def build(self, env: EnvBase, config: Config) -> Training:
         """Makes networks, loss, updater and learner."""
+
+
+@dataclass(frozen=True)
+class OnPolicy(Algorithm):
+    """An algorithm that learns from each batch while it is fresh.
+
+    Args:
+        epochs: passes over a batch, if not those of the configuration.
+        method: the step that a trust-region method takes with the actor.
+        projects: whether each batch has a second phase, CUP's projection.
+        max_kl: how far the policy may move in a phase, in nats, before it ends.
+        compiles: whether the loss is compiled in long runs. (Losses that ask PyTorch for the
+            divergence of two distributions do not compile to one graph.)
+    """
+
+    epochs: int | None = None
+    method: TrustRegionMethod | None = None
+    projects: bool = False
+    max_kl: float = math.inf
+    compiles: bool = False
+
+    def build(self, env: EnvBase, config: Config) -> Training:
         agent = make_agent(
             env, gamma=config.gamma, hidden=config.hidden, log_std=config.first_log_std
         )
@@ -155,7 +170,6 @@ class OnPolicy:
         discount = {"gamma": config.gamma, "lmbda": 0.95, "vectorized": True}
         loss.make_value_estimator(ValueEstimators.GAE, **discount)
         loss.make_cost_value_estimator(**discount)
-        _start_multiplier(loss, self.updater, config)
         batches = math.ceil(config.frames / config.frames_per_batch)
         step = None if self.method is None else TrustRegionStep(loss, self.method, max_kl=0.02)
         epochs = self.epochs or config.epochs
@@ -183,26 +197,16 @@ class OnPolicy:
 
 
 @dataclass(frozen=True)
-class OffPolicy:
+class OffPolicy(Algorithm):
     """An algorithm that learns from all it has ever seen.
 
     Args:
-        loss: called as ``loss(actor, critic, cost_critic, num_costs=, action_spec=)``.
         stochastic: whether the policy is a distribution; else noise is added to collect.
-        shield: filters the actions, if given.
-        settings: options of its own, in place of the defaults of :class:`Config`.
     """
 
-    loss: Callable[..., LossModule]
-    stochastic: bool
-    updater: Callable[[LossModule, Config], Updater | None] = move_multiplier
-    transforms: Callable[[Config], list[Transform]] = no_transforms
-    training_transforms: Callable[[Config], list[Transform]] = no_transforms
-    shield: Shield | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    stochastic: bool = field(kw_only=True)
 
     def build(self, env: EnvBase, config: Config) -> Training:
-        """Makes networks, loss, updater and learner."""
         agent = make_q_agent(
             env, gamma=config.gamma, stochastic=self.stochastic, hidden=config.hidden
         )
@@ -216,7 +220,6 @@ class OffPolicy:
         )
         loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
         loss.make_cost_value_estimator(gamma=config.gamma)
-        _start_multiplier(loss, self.updater, config)
         collector = agent.actor
         if not self.stochastic:
             noise = AdditiveGaussianModule(spec, sigma_init=0.3, sigma_end=0.3)
@@ -235,7 +238,6 @@ class OffPolicy:
         return Training(agent.actor, observation_spec, collector, loss, updater, learner)
 
 
-Algorithm = OnPolicy | OffPolicy
 # On-policy losses have no target networks, so their networks need no functional form. A gradient
 # step takes an eighth less time without it.
 _OPTIONS: dict[str, Any] = {
@@ -383,8 +385,3 @@ def own_settings(config: Config, algorithm: AlgorithmName) -> dict[str, Any]:
 def configured(config: Config, algorithm: AlgorithmName) -> Config:
     """Returns the configuration with what the algorithm sets."""
     return replace(config, **own_settings(config, algorithm))
-
-
-def _start_multiplier(loss: LossModule, updater: Any, config: Config) -> None:
-    if updater is move_multiplier:
-        loss.lagrange_multiplier.fill_(config.multiplier_init)

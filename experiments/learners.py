@@ -44,10 +44,7 @@ class Learner(Protocol):
         """Learns from a batch as a collector returns it."""
 
     def state(self) -> dict[str, Any]:
-        """What has been learnt, and what it is learnt with."""
-
-    def memory(self) -> dict[str, Any]:
-        """What else it needs to go on learning."""
+        """What has been learnt, and all that it takes to go on learning."""
 
 
 def summed(loss: Callable[[TensorDictBase], TensorDictBase]) -> Objective:
@@ -189,9 +186,6 @@ class OnPolicyLearner:
         }
         return state if self.actor_step is None else {**state, "actor_step": self.actor_step}
 
-    def memory(self) -> dict[str, Any]:
-        return {}  # The batch is forgotten, and its order is drawn from torch's own generator.
-
 
 class ReplayLearner:
     """Keeps all batches and takes gradient steps on samples of them.
@@ -235,10 +229,12 @@ class ReplayLearner:
         self.schedule.step()
 
     def state(self) -> dict[str, Any]:
-        return {"loss": self.loss, "optimizer": self.optimizer, "schedule": self.schedule}
-
-    def memory(self) -> dict[str, Any]:
-        return {"buffer": self.buffer}
+        return {
+            "loss": self.loss,
+            "optimizer": self.optimizer,
+            "schedule": self.schedule,
+            "buffer": self.buffer,
+        }
 
 
 def _falling(optimizer: torch.optim.Optimizer, batches: int) -> LRScheduler:

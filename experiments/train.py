@@ -223,7 +223,6 @@ def train(
             config.out / algorithm / "checkpoints",
             {
                 **training.state(),
-                **training.learner.memory(),
                 "collector": collector,
                 "log": log,
                 "generators": GlobalRNGState(),
