@@ -18,7 +18,17 @@ from torchrl.envs import EnvBase, GymEnv
 from benchmarks.floor import Tape
 from benchmarks.original import OriginalEnv
 from benchmarks.report import Figure
-from benchmarks.rollouts import Canned, episode, play, play_gym, rollout
+from benchmarks.rollouts import (
+    ACTIONS,
+    ENDLESS,
+    PANDA_GYM_EPISODE,
+    PANDA_GYM_SUBSTEPS,
+    Canned,
+    episode,
+    play,
+    play_gym,
+    rollout,
+)
 from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.agent import make_agent
 from torchrl_safe.envs import (
@@ -26,20 +36,15 @@ from torchrl_safe.envs import (
     PAPER_JOINT,
     ActionMode,
     ArmEnv,
-    CartesianDelta,
     JointDelta,
     NoObstacles,
     Scene,
     paper_env,
 )
 
-_ACTIONS: dict[str, ActionMode] = {"joint": JointDelta(), "Cartesian": CartesianDelta()}
 _PAPER_ACTIONS: dict[str, ActionMode] = {"joint": PAPER_JOINT, "Cartesian": PAPER_CARTESIAN}
 # Shares of the floor's steps/s.
 _BARS = {("joint", 1): 0.5, ("joint", 12): 0.75, ("Cartesian", 1): 0.4, ("Cartesian", 12): 0.7}
-# An episode that no measurement reaches the end of: resets are timed apart.
-_ENDLESS = 10**9
-_PANDA_GYM_SUBSTEPS, _PANDA_GYM_EPISODE = 20, 50
 
 
 def floor(env: ArmEnv, steps: int) -> Contender:
@@ -77,8 +82,8 @@ def collection(env: EnvBase, steps: int) -> Contender:
 def of_floor(quick: bool) -> Iterator[Figure]:
     """The share of the floor that a rollout of 32 worlds reaches at 12 substeps."""
     worlds, steps, rounds = (2, 4, 2) if quick else (32, 16, 9)
-    for name, action in _ACTIONS.items():
-        with closing(ArmEnv(num_envs=worlds, action=action, max_episode_steps=_ENDLESS)) as env:
+    for name, action in ACTIONS.items():
+        with closing(ArmEnv(num_envs=worlds, action=action, max_episode_steps=ENDLESS)) as env:
             times = race({"floor": floor(env, steps), "ours": rollout(env, steps)}, rounds=rounds)
         yield ratio(
             f"{name}, substeps 12, {worlds} worlds: Bullet / its floor",
@@ -91,11 +96,9 @@ def of_floor(quick: bool) -> Iterator[Figure]:
 def against_floor(quick: bool) -> Iterator[Figure]:
     """Rollout and collector against the bare steps of the same worlds."""
     counts, rounds = ((2,), 2) if quick else ((1, 8, 32, 64), 5)
-    for (name, action), substeps, worlds in product(_ACTIONS.items(), (1, 12), counts):
+    for (name, action), substeps, worlds in product(ACTIONS.items(), (1, 12), counts):
         steps = 8 if quick else max(16, (1024 if substeps == 1 else 256) // worlds)
-        env = ArmEnv(
-            num_envs=worlds, action=action, frame_skip=substeps, max_episode_steps=_ENDLESS
-        )
+        env = ArmEnv(num_envs=worlds, action=action, frame_skip=substeps, max_episode_steps=ENDLESS)
         with closing(env):
             times = race(
                 {
@@ -134,12 +137,12 @@ def against_single_world(quick: bool) -> Iterator[Figure]:
 def against_original(quick: bool) -> Iterator[Figure]:
     """Whole episodes of 500 steps, resets included, against the original code."""
     worlds, steps, rounds = (2, 8, 2) if quick else (32, 500, 3)
-    for name in _ACTIONS:
+    for name in ACTIONS:
         original = OriginalEnv("joint" if name == "joint" else "cartesian")
         lean = ArmEnv(
-            num_envs=worlds, action=_ACTIONS[name], frame_skip=1, max_episode_steps=_ENDLESS
+            num_envs=worlds, action=ACTIONS[name], frame_skip=1, max_episode_steps=ENDLESS
         )
-        paper = paper_env(_PAPER_ACTIONS[name], num_envs=worlds, max_episode_steps=_ENDLESS)
+        paper = paper_env(_PAPER_ACTIONS[name], num_envs=worlds, max_episode_steps=ENDLESS)
         actions = np.random.default_rng(0).uniform(-1, 1, (steps, 7 if name == "joint" else 4))
         with closing(original), closing(lean), closing(paper):
             times = race(
@@ -162,12 +165,12 @@ def against_original(quick: bool) -> Iterator[Figure]:
 def against_panda_gym(quick: bool) -> Iterator[Figure]:
     """Episodes of 50 steps of 20 substeps, resets included, against PandaReach-v3."""
     worlds, rounds = (2, 2) if quick else (32, 7)
-    steps = 4 if quick else _PANDA_GYM_EPISODE
+    steps = 4 if quick else PANDA_GYM_EPISODE
     settings: dict[str, Any] = {
         "num_envs": worlds,
         "obstacles": NoObstacles(),
-        "frame_skip": _PANDA_GYM_SUBSTEPS,
-        "max_episode_steps": _PANDA_GYM_EPISODE,
+        "frame_skip": PANDA_GYM_SUBSTEPS,
+        "max_episode_steps": PANDA_GYM_EPISODE,
     }
     theirs = gymnasium.make("PandaReach-v3")
     wrapped = GymEnv("PandaReach-v3")
@@ -187,7 +190,7 @@ def against_panda_gym(quick: bool) -> Iterator[Figure]:
         ("ArmEnv", "ArmEnv with movable fingers"), (("raw", 1.7), ("GymEnv", 2.0))
     ):
         yield ratio(
-            f"Cartesian, substeps {_PANDA_GYM_SUBSTEPS}, {worlds} worlds: {name} / "
+            f"Cartesian, substeps {PANDA_GYM_SUBSTEPS}, {worlds} worlds: {name} / "
             f"panda-gym, {theirs_name}",
             times[theirs_name] * worlds,
             times[name],

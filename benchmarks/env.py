@@ -18,15 +18,20 @@ from benchmarks import bullet
 from benchmarks.anatomy import anatomy
 from benchmarks.bare import bare_batch, torchrl_alone
 from benchmarks.report import Figure
-from benchmarks.rollouts import episode, play_gym, rollout
+from benchmarks.rollouts import (
+    ACTIONS,
+    ENDLESS,
+    PANDA_GYM_EPISODE,
+    PANDA_GYM_SUBSTEPS,
+    episode,
+    play_gym,
+    rollout,
+)
 from benchmarks.timing import quartiles, race, ratio, timed
 from torchrl_safe.envs import (
-    ActionMode,
     ArmEnv,
     Bullet,
-    CartesianDelta,
     Human,
-    JointDelta,
     MuJoCo,
     NoObstacles,
     Physics,
@@ -34,23 +39,20 @@ from torchrl_safe.envs import (
     SpeedAndSeparation,
 )
 
-_ACTIONS: dict[str, ActionMode] = {"joint": JointDelta(), "Cartesian": CartesianDelta()}
 _AT_LEAST = {1: 4.0, 12: 3.0}
-_ENDLESS = 10**9
-_PANDA_GYM_SUBSTEPS, _PANDA_GYM_EPISODE = 20, 50
 
 
 def against_bullet(quick: bool) -> Iterator[Figure]:
     """Rollouts of both, and of MuJoCo alone; processor time of one thread."""
     worlds, rounds = (2, 2) if quick else (128, 9)
-    for (name, action), substeps in product(_ACTIONS.items(), (12, 1)):
+    for (name, action), substeps in product(ACTIONS.items(), (12, 1)):
         steps = 4 if quick else (32 if substeps == 1 else 16)
         make = partial(
             ArmEnv,
             num_envs=worlds,
             action=action,
             frame_skip=substeps,
-            max_episode_steps=_ENDLESS,
+            max_episode_steps=ENDLESS,
         )
         with closing(make(physics=Bullet())) as theirs, closing(make(physics=MuJoCo(1))) as ours:
             times = race(
@@ -84,8 +86,8 @@ def against_bullet(quick: bool) -> Iterator[Figure]:
 def parts_of_a_step(quick: bool) -> Iterator[Figure]:
     """What a step costs beside physics, and where its time goes."""
     worlds, steps, rounds = (2, 4, 3) if quick else (128, 16, 9)
-    for name, action in _ACTIONS.items():
-        settings: dict[str, Any] = {"action": action, "max_episode_steps": _ENDLESS}
+    for name, action in ACTIONS.items():
+        settings: dict[str, Any] = {"action": action, "max_episode_steps": ENDLESS}
         with closing(ArmEnv(num_envs=worlds, physics=MuJoCo(1), **settings)) as env:
             alone = torchrl_alone(env, steps)
             turns = [(anatomy(env, steps), alone()) for _ in range(rounds)][1:]
@@ -102,8 +104,8 @@ def parts_of_a_step(quick: bool) -> Iterator[Figure]:
 def on_two_threads(quick: bool) -> Iterator[Figure]:
     """By the clock on the wall: needs two cores that are free."""
     worlds, steps, rounds = (2, 4, 2) if quick else (128, 16, 9)
-    for name, action in _ACTIONS.items():
-        make = partial(ArmEnv, num_envs=worlds, action=action, max_episode_steps=_ENDLESS)
+    for name, action in ACTIONS.items():
+        make = partial(ArmEnv, num_envs=worlds, action=action, max_episode_steps=ENDLESS)
         with closing(make(physics=Bullet())) as theirs, closing(make(physics=MuJoCo(2))) as ours:
             times = race(
                 {
@@ -123,7 +125,7 @@ def on_two_threads(quick: bool) -> Iterator[Figure]:
 def what_costs_cost(quick: bool) -> Iterator[Figure]:
     """A person with speed and separation monitoring, and a cylinder that is not to be touched."""
     worlds, steps, rounds = (2, 4, 2) if quick else (128, 16, 9)
-    make = partial(ArmEnv, num_envs=worlds, physics=MuJoCo(1), max_episode_steps=_ENDLESS)
+    make = partial(ArmEnv, num_envs=worlds, physics=MuJoCo(1), max_episode_steps=ENDLESS)
     costs = {"separation": SpeedAndSeparation()}
     with closing(make()) as plain, closing(make(obstacles=Human(), costs=costs)) as human:
         times = race(
@@ -141,13 +143,13 @@ def what_a_shield_costs(quick: bool) -> Iterator[Figure]:
     """The same random actions with a shield and without, beside one obstacle."""
     worlds, steps, rounds = (2, 4, 2) if quick else (32, 16, 9)
     engines: dict[str, Physics] = {"MuJoCo": MuJoCo(1), "Bullet": Bullet()}
-    for (name, action), (engine, physics) in product(_ACTIONS.items(), engines.items()):
+    for (name, action), (engine, physics) in product(ACTIONS.items(), engines.items()):
         make = partial(
             ArmEnv,
             num_envs=worlds,
             action=action,
             physics=physics,
-            max_episode_steps=_ENDLESS,
+            max_episode_steps=ENDLESS,
         )
         with closing(make()) as plain, closing(make(shield=Shield())) as shielded:
             times = race(
@@ -165,14 +167,14 @@ def what_a_shield_costs(quick: bool) -> Iterator[Figure]:
 def against_panda_gym(quick: bool) -> Iterator[Figure]:
     """Episodes of 50 steps of 20 substeps, resets included, against PandaReach-v3."""
     worlds, rounds = (2, 2) if quick else (128, 5)
-    steps = 4 if quick else _PANDA_GYM_EPISODE
+    steps = 4 if quick else PANDA_GYM_EPISODE
     theirs = gymnasium.make("PandaReach-v3")
     ours = ArmEnv(
         num_envs=worlds,
         physics=MuJoCo(1),
         obstacles=NoObstacles(),
-        frame_skip=_PANDA_GYM_SUBSTEPS,
-        max_episode_steps=_PANDA_GYM_EPISODE,
+        frame_skip=PANDA_GYM_SUBSTEPS,
+        max_episode_steps=PANDA_GYM_EPISODE,
     )
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, 3)).astype(np.float32)
     with closing(theirs), closing(ours):
@@ -184,7 +186,7 @@ def against_panda_gym(quick: bool) -> Iterator[Figure]:
             rounds=rounds,
         )
     yield ratio(
-        f"Cartesian, substeps {_PANDA_GYM_SUBSTEPS}, {worlds} worlds: MuJoCo / panda-gym, raw",
+        f"Cartesian, substeps {PANDA_GYM_SUBSTEPS}, {worlds} worlds: MuJoCo / panda-gym, raw",
         times["panda-gym"] * worlds,
         times["MuJoCo"],
         at_least=5,

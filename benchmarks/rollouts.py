@@ -12,6 +12,12 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from benchmarks.timing import Contender, timed
+from torchrl_safe.envs import ActionMode, CartesianDelta, JointDelta
+
+ACTIONS: dict[str, ActionMode] = {"joint": JointDelta(), "Cartesian": CartesianDelta()}
+# An episode that no measurement reaches the end of: resets are timed apart.
+ENDLESS = 10**9
+PANDA_GYM_SUBSTEPS, PANDA_GYM_EPISODE = 20, 50
 
 
 class Canned:

@@ -14,18 +14,17 @@ from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 
 from benchmarks.report import Figure
-from benchmarks.rollouts import rollout
+from benchmarks.rollouts import ENDLESS, rollout
 from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.agent import make_agent
 from torchrl_safe.envs import ArmEnv, Collision, JointDelta, NoObstacles, Scattered
 
-_ENDLESS = 10**9
 _RAY = {"num_cpus": 1, "num_gpus": 0, "memory": 512 * 2**20}
 
 
 def make_env(worlds: int, **settings: Any) -> ArmEnv:
     """Makes an environment that is only reset by success."""
-    settings = {"action": JointDelta(), "max_episode_steps": _ENDLESS, **settings}
+    settings = {"action": JointDelta(), "max_episode_steps": ENDLESS, **settings}
     return ArmEnv(num_envs=worlds, **settings)
 
 

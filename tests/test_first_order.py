@@ -42,9 +42,7 @@ from torchrl_safe.objectives import (
     penalized_advantage,
 )
 from torchrl_safe.objectives.on_policy.crpo import rectified_advantage
-from torchrl_safe.objectives.on_policy.cup import projection_objective
 from torchrl_safe.objectives.on_policy.ipo import log_barrier
-from torchrl_safe.objectives.on_policy.p3o import exact_penalty
 from torchrl_safe.objectives.on_policy.policies import divergence
 from torchrl_safe.objectives.on_policy.surrogate import clipped_cost_surrogate
 from torchrl_safe.testing import make_batch, make_critic, make_networks
@@ -64,12 +62,6 @@ def test_the_cost_surrogate_takes_the_larger_product():
     torch.testing.assert_close(weighted, 2 * expected)
 
 
-def test_the_exact_penalty_is_nothing_below_and_linear_above_the_limit():
-    surrogate, violation = torch.tensor([0.25, 0.25, -0.75]), torch.tensor([-6.0, 2.0, 4.0])
-    penalty = exact_penalty(surrogate, violation, scale=0.125, coeff=20.0)
-    assert penalty.tolist() == [0.0, 20 * 0.5, 0.0]
-
-
 def test_the_barrier_is_a_logarithm_with_a_tangent():
     sharpness = torch.tensor(2.0, dtype=torch.float64)
     violation = torch.tensor([-math.e, -1.0, -0.25, 0.0, 3.0], dtype=torch.float64)
@@ -85,17 +77,6 @@ def test_the_barrier_is_a_logarithm_with_a_tangent():
     near = torch.tensor([-0.25 - 1e-9, -0.25 + 1e-9], dtype=torch.float64, requires_grad=True)
     log_barrier(near, sharpness).sum().backward()
     torch.testing.assert_close(near.grad, torch.full((2,), 2.0).double())
-
-
-def test_the_projection_adds_scaled_costs_to_the_divergence():
-    objective = projection_objective(
-        kl=torch.tensor([[0.5], [0.0]]),
-        ratio=torch.tensor([[2.0], [1.0]]),
-        cost_advantage=torch.tensor([[1.0, 3.0], [-1.0, 2.0]]),
-        lagrange_multiplier=torch.tensor([2.0, 0.5]),
-        scale=4.0,
-    )
-    assert objective.tolist() == [[0.5 + 4 * 2 * 3.5], [4 * (-1.0)]]
 
 
 def test_the_worst_cost_above_the_tolerance_takes_the_place_of_the_reward():

@@ -9,6 +9,7 @@ one number for each cost. Needs SciPy: ``pip install "torchrl-safe[metrics]"``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple
 
@@ -255,10 +256,7 @@ def interquartile_mean(
         >>> interquartile_mean(torch.tensor([[0.0], [1.0], [2.0], [99.0]])).value
         tensor([1.5000], dtype=torch.float64)
     """
-
-    def middle(values: np.ndarray, axis: int) -> np.ndarray:
-        return stats.trim_mean(values, 0.25, axis=axis)
-
+    middle = partial(stats.trim_mean, proportiontocut=0.25)
     return _bootstrap(middle, episode_cost, resample, confidence, seed)
 
 

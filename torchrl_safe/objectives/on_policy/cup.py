@@ -21,39 +21,6 @@ from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 from torchrl_safe.objectives.on_policy.policies import actor_params, divergence
 
 
-def projection_objective(
-    kl: Tensor,
-    ratio: Tensor,
-    cost_advantage: Tensor,
-    lagrange_multiplier: Tensor,
-    scale: Tensor | float,
-) -> Tensor:
-    r"""CUP's projection: stay near the improved policy, and cost less.
-
-    .. math::
-        D_{KL}(\pi_\theta \| \pi_{k + 1/2}) + s \sum_i \nu_i \, r A_{c_i}
-
-    (Yang et al. 2022, https://arxiv.org/abs/2209.07089, with
-    :math:`s = (1 - \gamma \lambda) / (1 - \gamma)`.)
-
-    Args:
-        kl (Tensor): divergence from the improved policy, shape ``(*B, 1)``.
-        ratio (Tensor): ratio r to the policy that collected the batch, shape ``(*B, 1)``.
-        cost_advantage (Tensor): advantage of each of the k costs, shape ``(*B, k)``.
-        lagrange_multiplier (Tensor): non-negative multipliers, shape ``(k,)``.
-        scale (Tensor or float): the factor s, which makes up for the trace decay of GAE.
-
-    Returns:
-        The objective, to be minimized, shape ``(*B, 1)``.
-
-    Raises:
-        ValueError: if there is not one advantage for each multiplier.
-    """
-    check_columns(cost_advantage, "multiplier", lagrange_multiplier)
-    cost = (lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
-    return kl + scale * ratio * cost
-
-
 class CUPLoss(ConstrainedPPO, ClipPPOLoss):
     r"""Improves the policy with clipped PPO, then projects it towards the limits of k costs.
 
@@ -184,13 +151,13 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             raise RuntimeError("Call start_projection before projection_loss, once in each batch.")
         tensordict = tensordict.clone(False)
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
+        check_columns(cost_advantage, "multiplier", self.lagrange_multiplier)
         improved = self._improved_policy(tensordict)
         shape = cost_advantage.shape[:-1]
         policy = self.evaluate(tensordict).joint(shape)
         kl = divergence(policy.distribution, improved, shape)
-        objective = projection_objective(
-            kl, policy.ratio(), cost_advantage, self.lagrange_multiplier, self._cost_scale()
-        )
+        cost = (self.lagrange_multiplier * cost_advantage).sum(-1, keepdim=True)
+        objective = kl + self._cost_scale() * policy.ratio() * cost
         return TensorDict(
             loss_projection=reduced(self, objective, tensordict).squeeze(-1),
             kl=reduced(self, kl.detach(), tensordict, reduction="mean"),

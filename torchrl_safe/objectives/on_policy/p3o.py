@@ -12,30 +12,6 @@ from torchrl_safe.objectives._checks import coefficients
 from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
-def exact_penalty(
-    surrogate: Tensor, violation: Tensor, scale: Tensor | float, coeff: Tensor | float
-) -> Tensor:
-    r"""P3O's penalty: nothing below the limit, proportional to the violation above it.
-
-    .. math::
-        \kappa \max(0,\ L_{c_i} + s (J_{c_i} - d_i))
-
-    (Zhang et al. 2022, https://arxiv.org/abs/2205.11814, where :math:`s = 1 - \gamma`.)
-
-    Args:
-        surrogate (Tensor): mean surrogate :math:`L_{c_i}` of each cost, cost per step, shape
-            ``(k,)``.
-        violation (Tensor): mean episode cost minus limit, shape ``(k,)``.
-        scale (Tensor or float): the factor s, which brings a violation to the unit of a surrogate:
-            1 divided by the steps of an episode.
-        coeff (Tensor or float): the factor :math:`\kappa`.
-
-    Returns:
-        The penalty of each cost, shape ``(k,)``.
-    """
-    return coeff * (surrogate + scale * violation).relu()
-
-
 class P3OLoss(CostSurrogate, ClipPPOLoss):
     r"""Clipped PPO loss with an exact penalty on k expected costs.
 
@@ -132,4 +108,4 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
 
     def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:
         # kappa max(0, surrogate + (1 - gamma) (J_c - d))
-        return exact_penalty(surrogate, self.cost_violation, scale, self.penalty_coeff)
+        return self.penalty_coeff * (surrogate + scale * self.cost_violation).relu()
