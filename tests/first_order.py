@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from on_policy import around
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives import (
@@ -17,12 +18,7 @@ from torchrl_safe.objectives import (
 )
 from torchrl_safe.testing import make_actor, make_networks
 
-
-def crpo(actor, critic, cost_critic, *, num_costs=1, tolerance=0.0, **kwargs):
-    parent = ClipPPOLoss(actor, critic, **kwargs)
-    return CRPOLoss(parent, cost_critic, num_costs=num_costs, tolerance=tolerance)
-
-
+crpo = around(CRPOLoss, ClipPPOLoss)
 # The batch is of another policy, far outside the trust region of FOCOPS.
 near = partial(FOCOPSLoss, kl_bound=1.0)
 LOSSES = {"focops": near, "cup": CUPLoss, "p3o": P3OLoss, "ipo": IPOLoss, "crpo": crpo}

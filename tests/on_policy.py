@@ -61,6 +61,16 @@ def make_composite(num_costs):
     return actor, make_critic(), make_critic("cost_value", num_costs), batch
 
 
+def around(kind, parent):
+    """A loss around another one, as a function of the networks; most options are the parent's."""
+
+    def make(actor, critic, cost_critic, **options):
+        own = {name: options.pop(name) for name in ("num_costs", "tolerance") if name in options}
+        return kind(parent(actor, critic, **options), cost_critic, **own)
+
+    return make
+
+
 def parameters(loss, network):
     if loss.functional:
         return list(getattr(loss, f"{network}_network_params").values(True, True))

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from on_policy import make_composite
+from on_policy import around, make_composite
 from tensordict.nn import (
     NormalParamExtractor,
     ProbabilisticTensorDictSequential,
@@ -44,17 +44,6 @@ from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_networks
 
-
-def wrapping(make, parent):
-    """``make`` around ``parent``, as a function of the networks."""
-
-    def build(actor, critic, cost_critic, *, num_costs=1, cost_critic_coeff=1.0, **kwargs):
-        wrapped = parent(actor, critic, **kwargs)
-        return make(wrapped, cost_critic, num_costs=num_costs, cost_critic_coeff=cost_critic_coeff)
-
-    return build
-
-
 SUBCLASSES = {
     "ppo-lagrangian": (PPOLagrangianLoss, ClipPPOLoss),
     "focops": (partial(FOCOPSLoss, kl_bound=float("inf"), temperature=1.0), PPOLoss),
@@ -62,15 +51,15 @@ SUBCLASSES = {
     "p3o": (P3OLoss, ClipPPOLoss),
     "ipo": (IPOLoss, ClipPPOLoss),
     "trust-region": (TrustRegionLoss, PPOLoss),
-    "lagrangian-clip-ppo": (wrapping(LagrangianLoss, ClipPPOLoss), ClipPPOLoss),
-    "lagrangian-kl-ppo": (wrapping(LagrangianLoss, KLPENPPOLoss), KLPENPPOLoss),
-    "crpo-clip-ppo": (wrapping(CRPOLoss, ClipPPOLoss), ClipPPOLoss),
+    "lagrangian-clip-ppo": (around(LagrangianLoss, ClipPPOLoss), ClipPPOLoss),
+    "lagrangian-kl-ppo": (around(LagrangianLoss, KLPENPPOLoss), KLPENPPOLoss),
+    "crpo-clip-ppo": (around(CRPOLoss, ClipPPOLoss), ClipPPOLoss),
 }
 # These evaluate their policy on a copy of their own: the trunk is evaluated once more.
 OTHERS = {
-    "lagrangian-a2c": (wrapping(LagrangianLoss, A2CLoss), A2CLoss),
-    "lagrangian-reinforce": (wrapping(LagrangianLoss, ReinforceLoss), ReinforceLoss),
-    "crpo-a2c": (wrapping(CRPOLoss, A2CLoss), A2CLoss),
+    "lagrangian-a2c": (around(LagrangianLoss, A2CLoss), A2CLoss),
+    "lagrangian-reinforce": (around(LagrangianLoss, ReinforceLoss), ReinforceLoss),
+    "crpo-a2c": (around(CRPOLoss, A2CLoss), A2CLoss),
 }
 every_loss = pytest.mark.parametrize(
     "make", [make for make, _ in SUBCLASSES.values()], ids=SUBCLASSES
@@ -78,6 +67,26 @@ every_loss = pytest.mark.parametrize(
 all_losses = pytest.mark.parametrize(
     "make", [make for make, _ in {**SUBCLASSES, **OTHERS}.values()], ids=[*SUBCLASSES, *OTHERS]
 )
+
+
+# ---------------------------------------------------------------- outputs and state
+
+
+@all_losses
+def test_what_a_call_returns_is_announced(make):
+    loss = make(*make_networks(2), num_costs=2)
+    # TorchRL does not announce these two.
+    unannounced = {"explained_variance", "kl_approx"}
+    assert set(loss(make_batch(2)).keys()) - set(loss.out_keys) <= unannounced
+
+
+@all_losses
+def test_the_discounts_go_with_the_state(make):
+    saved, loaded = (make(*make_networks()) for _ in range(2))
+    saved.make_cost_value_estimator(gamma=0.5).make_value_estimator(gamma=0.25)
+    loaded.load_state_dict(saved.state_dict(), strict=True)
+    assert loaded.cost_value_estimator.gamma == 0.5
+    assert getattr(loaded, "loss_module", loaded).value_estimator.gamma == 0.25
 
 
 # ---------------------------------------------------------------- critics that are heads

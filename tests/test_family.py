@@ -11,6 +11,7 @@ from functools import partial
 
 import pytest
 import torch
+from on_policy import around
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, ReinforceLoss
 
 from torchrl_safe.objectives import (
@@ -46,15 +47,6 @@ pid = partial(
 )
 
 
-def wrapping(make, parent):
-    """``make`` around ``parent``, as a function of the networks."""
-
-    def build(actor, critic, cost_critic, num_costs):
-        return make(parent(actor, critic), cost_critic, num_costs=num_costs)
-
-    return build
-
-
 def of_one_step(make, **kwargs):
     """``make`` for episodes of one step, as a function of the networks."""
 
@@ -78,15 +70,15 @@ def violation(loss):
 
 NO_BONUS = {"entropy_bonus": False}
 LAGRANGIAN = {
-    "a2c": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(A2CLoss, **NO_BONUS)),
-    "reinforce": wrapping(partial(LagrangianLoss, **IN_UNITS), ReinforceLoss),
-    "clip-ppo": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(ClipPPOLoss, **NO_BONUS)),
-    "kl-ppo": wrapping(partial(LagrangianLoss, **IN_UNITS), partial(KLPENPPOLoss, **NO_BONUS)),
+    "a2c": around(partial(LagrangianLoss, **IN_UNITS), partial(A2CLoss, **NO_BONUS)),
+    "reinforce": around(partial(LagrangianLoss, **IN_UNITS), ReinforceLoss),
+    "clip-ppo": around(partial(LagrangianLoss, **IN_UNITS), partial(ClipPPOLoss, **NO_BONUS)),
+    "kl-ppo": around(partial(LagrangianLoss, **IN_UNITS), partial(KLPENPPOLoss, **NO_BONUS)),
     "focops": of_one_step(FOCOPSLoss, **IN_UNITS),
 }
 CRPO = {
-    "a2c": wrapping(CRPOLoss, partial(A2CLoss, **NO_BONUS)),
-    "clip-ppo": wrapping(CRPOLoss, partial(ClipPPOLoss, **NO_BONUS)),
+    "a2c": around(CRPOLoss, partial(A2CLoss, **NO_BONUS)),
+    "clip-ppo": around(CRPOLoss, partial(ClipPPOLoss, **NO_BONUS)),
 }
 
 

@@ -1,13 +1,11 @@
-"""What FOCOPS, CUP, P3O, IPO and CRPO share: keys, states, casts, compilation, refusals."""
+"""What FOCOPS, CUP, P3O, IPO and CRPO share beside what test_testing.py checks of all losses."""
 
-import copy
 from functools import partial
 
 import pytest
 import torch
 from first_order import LOSSES, build, crpo, every_loss, step, train
 from on_policy import estimated
-from tensordict.utils import unravel_key
 from torchrl.objectives import A2CLoss, KLPENPPOLoss
 from torchrl.objectives.value import TD0Estimator
 
@@ -25,106 +23,6 @@ from torchrl_safe.objectives import (
 from torchrl_safe.testing import make_batch, make_critic, make_networks
 
 # ---------------------------------------------------------------- what all of them share
-
-
-@every_loss
-def test_each_loss_trains_one_network(make):
-    loss = build(make, 2)
-    step(loss, [5.0, 1.0])
-    data = estimated(loss, 2)
-    expected = {"loss_critic": "critic", "loss_cost_critic": "cost_critic"}
-    keys = [key for key, _ in loss(data).items() if key.startswith("loss_")]
-    assert len(keys) >= 4
-    for key in keys:
-        loss.zero_grad()
-        loss(data)[key].backward()
-        reached = {
-            name.removeprefix("loss_module.").split("_network")[0]
-            for name, p in loss.named_parameters()
-            if p.grad is not None and p.grad.any()
-        }
-        assert reached == {expected.get(key, "actor")}, key
-
-
-@every_loss
-def test_the_loss_writes_nothing_into_its_input(make):
-    loss, batch = build(make, 2), make_batch(2)
-    step(loss, [5.0, 1.0])
-    before = batch.clone()
-    loss(batch)
-    assert set(batch.keys(True)) == set(before.keys(True))
-    assert (batch == before).all()
-
-
-NESTED = {
-    "advantage": ("estimates", "a"),
-    "value_target": ("estimates", "t"),
-    "value": ("estimates", "v"),
-    "cost_advantage": ("estimates", "ca"),
-    "cost_value_target": ("estimates", "ct"),
-    "cost_value": ("estimates", "cv"),
-    "reward": ("info", "reward"),
-    "cost": ("info", "cost"),
-}
-
-
-@every_loss
-def test_all_keys_can_be_nested(make):
-    networks = make_networks(2, keys=NESTED)
-    loss, expected = make(*networks, num_costs=2), build(make, 2)
-    loss.set_keys(**NESTED)
-    assert ("next", "info", "cost") in loss.in_keys
-    batch = make_batch(2)
-    for key in ("reward", "cost"):
-        batch["next"].rename_key_(key, ("info", key))
-    step(loss, [5.0, 1.0])
-    step(expected, [5.0, 1.0])
-    losses, outputs = loss(estimated_in(loss, batch)), expected(estimated(expected, 2))
-    assert set(losses.keys()) == set(outputs.keys())
-    for key, value in outputs.items():
-        assert torch.equal(losses[key], value), key
-
-
-def estimated_in(loss, batch):
-    return loss.estimate_advantages(batch).reshape(-1)
-
-
-@every_loss
-def test_call_with_keywords_equals_call_with_tensordict(make):
-    loss, batch = build(make, 2), make_batch(2)
-    step(loss, [5.0, 1.0])
-    expected = loss(batch)
-    keys = {"_".join(k) if isinstance(k, tuple) else k: k for k in map(unravel_key, loss.in_keys)}
-    outputs = loss(**{name: batch[key] for name, key in keys.items()})
-    for key, output in zip(loss.out_keys, outputs, strict=True):
-        torch.testing.assert_close(output, expected[key])
-    # TorchRL does not announce these two.
-    assert set(expected.keys()) - set(loss.out_keys) <= {"explained_variance", "kl_approx"}
-
-
-@every_loss
-@pytest.mark.parametrize("used", ["saved", "loaded"])
-def test_state_goes_between_a_fresh_and_a_used_loss(make, used):
-    saved, loaded = build(make, 2), build(make, 2, seed=5)
-    saved.make_cost_value_estimator(gamma=0.5)
-    step(saved, [5.0, 1.0])
-    batch = make_batch(2)
-    {"saved": saved, "loaded": loaded}[used](batch)
-    assert loaded.load_state_dict(saved.state_dict(), strict=True)
-    expected = saved(batch)
-    for twin in (loaded, copy.deepcopy(saved)):
-        outputs = twin(batch)
-        for key, value in expected.items():
-            assert torch.equal(outputs[key], value), key
-
-
-@every_loss
-def test_cast_to_double(make):
-    loss = build(make, 2).to(torch.float64)
-    step(loss, [5.0, 1.0])
-    batch = make_batch(2).apply(lambda x: x.double() if x.is_floating_point() else x)
-    losses = loss(estimated_in(loss, batch))
-    assert {v.dtype for k, v in losses.items() if k.startswith("loss_")} == {torch.float64}
 
 
 def test_cup_keeps_the_improved_policy_in_its_state():

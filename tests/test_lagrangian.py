@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from on_policy import assert_same_outputs, make_loss
+from on_policy import around, assert_same_outputs, make_loss
 from tensordict.nn import (
     NormalParamExtractor,
     ProbabilisticTensorDictModule,
@@ -13,7 +13,6 @@ from tensordict.nn import (
     TensorDictModule,
     TensorDictSequential,
 )
-from tensordict.utils import unravel_key
 from torch import nn
 from torch.distributions.transforms import SoftplusTransform
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -29,7 +28,13 @@ from torchrl.objectives import (
 )
 
 from torchrl_safe.objectives import DualAscent, LagrangianLoss, PIDControl, penalized_advantage
-from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
+from torchrl_safe.testing import (
+    OBSERVATION_SIZE,
+    check_state_dict,
+    make_batch,
+    make_critic,
+    make_networks,
+)
 
 PARENTS = {
     "a2c": A2CLoss,
@@ -195,15 +200,6 @@ def test_only_the_policy_trains_a_shared_trunk_with_separate_losses(parent, sepa
         assert (trunk.module.weight.grad is not None) == shared
 
 
-def test_the_wrapper_writes_nothing_into_its_input():
-    for parent in (A2CLoss, ReinforceLoss, ClipPPOLoss, KLPENPPOLoss):
-        loss, batch = wrap(parent, 2, multiplier_init=1.0), make_batch(2)
-        before = batch.clone()
-        loss(batch)
-        assert set(batch.keys(True)) == set(before.keys(True))
-        assert (batch == before).all()
-
-
 @pytest.mark.parametrize("parent", [A2CLoss, ReinforceLoss, ClipPPOLoss])
 def test_all_keys_can_be_nested(parent):
     values = {"value": ("estimates", "v"), "cost_value": ("estimates", "c")}
@@ -240,28 +236,9 @@ def test_an_unknown_key_is_refused():
         wrap(A2CLoss).set_keys(cost_limit="anything")
 
 
-@pytest.mark.parametrize("parent", [A2CLoss, ReinforceLoss, ClipPPOLoss])
-def test_call_with_keywords_equals_call_with_tensordict(parent):
-    loss, batch = wrap(parent, 2, multiplier_init=0.7), make_batch(2)
-    expected = loss(batch)
-    keys = {"_".join(k) if isinstance(k, tuple) else k: k for k in map(unravel_key, loss.in_keys)}
-    outputs = loss(**{name: batch[key] for name, key in keys.items()})
-    assert {"loss_cost_critic", "lagrange_multiplier_1"} <= set(loss.out_keys)
-    for key, output in zip(loss.out_keys, outputs, strict=True):
-        torch.testing.assert_close(output, expected[key])
-
-
 @every_parent
-@pytest.mark.parametrize("used", ["saved", "loaded"])
-def test_state_goes_between_a_fresh_and_a_used_loss(parent, used):
-    saved, loaded = wrap(parent, 2, multiplier_init=1.5), wrap(parent, 2, seed=5)
-    saved.make_value_estimator(gamma=0.5, lmbda=0.9).make_cost_value_estimator(gamma=0.7)
-    batch = make_batch(2)
-    {"saved": saved, "loaded": loaded}[used](batch)
-    assert loaded.load_state_dict(saved.state_dict(), strict=True)
-    assert loaded.lagrange_multiplier.tolist() == [1.5, 1.5]
-    assert_same_outputs(loaded(batch), saved(batch))
-    assert_same_outputs(copy.deepcopy(saved)(batch), saved(batch))
+def test_states_and_copies(parent):
+    check_state_dict(around(LagrangianLoss, parent), make_data=make_batch)
 
 
 def test_cast_and_reset():

@@ -15,7 +15,6 @@ from off_policy import (
     make_kind,
     make_loss,
     make_parent,
-    networks_with_gradient,
     parameters,
 )
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -291,17 +290,6 @@ def test_the_objective_by_hand(kind):
     # The largest predictions are 3 and 0; the entropy of SAC is divided with the rest.
     expected = (without + 0.5 * 3 + 2.0 * 0) / (1 + 0.5 + 2.0)
     torch.testing.assert_close(call(loss, batch)["loss_actor"], expected)
-
-
-@pytest.mark.parametrize("name", TRAINS)
-@each_loss
-def test_each_loss_trains_one_network(kind, name):
-    loss = make_loss(kind, 2, multiplier_init=0.7)
-    losses = loss(make_transitions(2))
-    extra = {"loss_alpha"} & set(loss.out_keys)
-    assert {key for key, value in losses.items() if value.requires_grad} == {*TRAINS, *extra}
-    losses[name].backward()
-    assert networks_with_gradient(loss) == {TRAINS[name]}
 
 
 @pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])

@@ -1,6 +1,7 @@
 """PPOLagrangianLoss: how it plugs in. Keys, state, copies, compilation, batches that do not fit."""
 
 import copy
+from functools import partial
 
 import pytest
 import torch
@@ -21,7 +22,7 @@ from torch import nn
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss, penalized_advantage
-from torchrl_safe.testing import make_batch, make_critic, make_networks
+from torchrl_safe.testing import check_state_dict, make_batch, make_critic, make_networks
 
 # ---------------------------------------------------------------- data that do not fit
 
@@ -182,16 +183,8 @@ def test_select_out_keys():
 # ---------------------------------------------------------------- state, casts, copies
 
 
-@pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
-@pytest.mark.parametrize("used", ["saved", "loaded"])
-def test_state_goes_between_a_fresh_and_a_used_loss(used, functional):
-    saved = make_loss(2, multiplier_init=1.5, functional=functional)
-    loaded = make_loss(2, seed=5, functional=functional)
-    batch = make_batch(2)
-    {"saved": saved, "loaded": loaded}[used](batch)
-    assert loaded.load_state_dict(saved.state_dict(), strict=True)
-    assert loaded.lagrange_multiplier.tolist() == [1.5, 1.5]
-    assert_same_outputs(loaded(batch), saved(batch))
+def test_states_and_copies_of_networks_that_are_not_functional():
+    check_state_dict(partial(PPOLagrangianLoss, functional=False), make_data=make_batch)
 
 
 def test_state_includes_the_discounts_and_works_inside_a_module():

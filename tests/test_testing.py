@@ -7,6 +7,8 @@ from functools import partial
 
 import pytest
 import torch
+from off_policy import TRAINS as Q_TRAINS
+from on_policy import TRAINS, around
 from torchrl.objectives import (
     A2CLoss,
     ClipPPOLoss,
@@ -36,15 +38,6 @@ from torchrl_safe.objectives import (
 # ---------------------------------------------------------------- ours pass
 
 
-def around(kind, parent):
-    """A loss around another one, as a function of the networks."""
-
-    def make(actor, critic, cost_critic, **kwargs):
-        return kind(parent(actor, critic), cost_critic, **kwargs)
-
-    return make
-
-
 BY_MULTIPLIER = {
     "ppo-lagrangian": PPOLagrangianLoss,
     "a2c": around(LagrangianLoss, A2CLoss),
@@ -70,22 +63,36 @@ OFF_POLICY = {
 }
 
 
+# Which network each output trains. Those of ReinforceLoss have names of their own.
+EVERY_OUTPUT = {
+    **TRAINS,
+    **Q_TRAINS,
+    "loss_kl": "actor",
+    "loss_penalty": "actor",
+    "loss_value": "critic",
+}
+
+
 ON_POLICY_CHECKS = (
-    testing.check_gradients,
+    partial(testing.check_gradients, trains=EVERY_OUTPUT),
     testing.check_multiplier_direction,
     testing.check_num_costs,
     testing.check_masked_steps,
     testing.check_keys,
     partial(testing.check_keys, nested=False, make_data=testing.make_batch),
+    partial(testing.check_keys, names=("reward", "cost"), make_data=testing.make_batch),
     testing.check_dispatch,
     testing.check_input_unchanged,
+    partial(testing.check_input_unchanged, make_data=testing.make_batch),
     testing.check_state_dict,
+    partial(testing.check_state_dict, make_data=testing.make_batch),
     testing.check_cast,
+    partial(testing.check_cast, make_data=testing.make_batch),
 )
 
 
 OFF_POLICY_CHECKS = (
-    testing.check_gradients,
+    partial(testing.check_gradients, trains=EVERY_OUTPUT),
     testing.check_q_multiplier_direction,
     testing.check_masked_steps,
     partial(testing.check_keys, names=testing.OFF_POLICY_KEYS),
