@@ -8,8 +8,7 @@ import pybullet
 import pytest
 import torch
 from bullet_worlds import make_world, worlds_of
-from tensordict import TensorDict
-from worlds import ARMS, ENGINES, each_arm
+from worlds import ARMS, ENGINES, each_arm, step
 
 from torchrl_safe.envs import (
     IIWA,
@@ -110,10 +109,6 @@ def pose(tmp_path):
 def axes(orientation):
     """The axes of a frame, as columns."""
     return np.array(pybullet.getMatrixFromQuaternion(orientation)).reshape(3, 3)
-
-
-def step(env, action):
-    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
 
 
 @each_arm

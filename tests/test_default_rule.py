@@ -2,14 +2,13 @@
 
 import pytest
 import torch
-from torchrl.objectives import LossModule
+from rules import make_module
 
 from torchrl_safe.objectives import PIDControl
 
 
 def make_updater(*multiplier, cost_limit=10.0, pessimism=0.0, **kwargs):
-    module = LossModule()
-    module.register_buffer("lagrange_multiplier", torch.tensor(multiplier or (0.0,)))
+    module = make_module(*(multiplier or (0.0,)))
     return PIDControl(module, cost_limit=cost_limit, pessimism=pessimism, **kwargs)
 
 

@@ -10,7 +10,6 @@ from typing import get_args
 import matplotlib.pyplot as plt
 import pytest
 import torch
-import tyro
 from PIL import Image
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
@@ -126,17 +125,6 @@ def test_resuming_where_no_run_is_says_so(tmp_path, capsys):
     (tmp_path / "notes.txt").touch()
     with pytest.raises(FileExistsError, match=r"out must be .* There is no run in it to resume\."):
         start(Config(out=tmp_path, resume=True))
-
-
-def test_help_names_the_options(capsys):
-    with pytest.raises(SystemExit, match="0"):
-        tyro.cli(Config, args=["--help"])
-    shown = capsys.readouterr().out
-    for option in (
-        "arm", "action", "algorithms", "cost-limit", "frames", "envs", "workers", "seed", "out",
-        "logger", "multiplier-rule",
-    ):  # fmt: skip
-        assert f"--{option}" in shown
 
 
 def test_help_is_short_and_grouped(capsys):
