@@ -40,20 +40,6 @@ def step(loss, violation):
         DualAscent(loss, cost_limit=0.0, lr=1.0).step(violation.unsqueeze(0))
 
 
-def total(losses):
-    return sum(value for key, value in losses.items() if key.startswith("loss_"))
-
-
-def train(loss, data, updates=20):
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
-    order = torch.Generator().manual_seed(3)
-    for _ in range(updates):
-        minibatch = data[torch.randperm(len(data), generator=order)[:8]]
-        total(loss(minibatch)).backward()
-        optimizer.step()
-        optimizer.zero_grad()
-
-
 def shift(loss):
     """Moves the policy, as the gradient steps of a phase do."""
     noise = torch.Generator().manual_seed(4)

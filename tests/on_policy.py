@@ -3,9 +3,15 @@
 from functools import partial
 
 import torch
-from tensordict.nn import CompositeDistribution, TensorDictModule
+from tensordict.nn import (
+    CompositeDistribution,
+    NormalParamExtractor,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from torch import nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 
 from torchrl_safe.objectives import PPOLagrangianLoss
 from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
@@ -26,19 +32,21 @@ def make_loss(num_costs=1, seed=0, **kwargs):
     return PPOLagrangianLoss(*networks, num_costs=num_costs, **kwargs)
 
 
+class Heads(nn.Module):
+    """A normal head and a categorical one."""
+
+    def __init__(self):
+        super().__init__()
+        self.body = mlp(OBSERVATION_SIZE, 5)
+
+    def forward(self, observation):
+        out = self.body(observation)
+        return out[..., :1], out[..., 1:2].exp(), out[..., 2:]
+
+
 def make_composite(num_costs):
     """Actor with a continuous and a discrete head, the critics, and a batch."""
     torch.manual_seed(0)
-
-    class Heads(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.body = mlp(OBSERVATION_SIZE, 5)
-
-        def forward(self, observation):
-            out = self.body(observation)
-            return out[..., :1], out[..., 1:2].exp(), out[..., 2:]
-
     params = [("params", "move", "loc"), ("params", "move", "scale"), ("params", "grip", "logits")]
     actor = ProbabilisticActor(
         TensorDictModule(Heads(), ["observation"], params),
@@ -59,6 +67,24 @@ def make_composite(num_costs):
         for key in ("move_log_prob", "grip_log_prob"):  # As of an older policy.
             batch[key] = batch[key] + 0.2 * torch.randn_like(batch[key])
     return actor, make_critic(), make_critic("cost_value", num_costs), batch
+
+
+def make_trunk(num_costs):
+    """Three networks that share their first layer, and that layer."""
+    torch.manual_seed(0)
+    trunk = TensorDictModule(nn.Linear(OBSERVATION_SIZE, 8), ["observation"], ["hidden"])
+    policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
+    head = ProbabilisticActor(
+        TensorDictModule(policy, ["hidden"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    critic = TensorDictSequential(trunk, ValueOperator(nn.Linear(8, 1), in_keys=["hidden"]))
+    cost_critic = TensorDictSequential(
+        trunk, ValueOperator(nn.Linear(8, num_costs), in_keys=["hidden"], out_keys=["cost_value"])
+    )
+    return (ProbabilisticTensorDictSequential(trunk, *head), critic, cost_critic), trunk.module
 
 
 def around(kind, parent):
@@ -94,6 +120,20 @@ def assert_close_outputs(actual, expected):
     assert set(actual.keys()) == set(expected.keys())
     for key, value in expected.items():
         torch.testing.assert_close(actual[key], value, msg=lambda text, key=key: f"{key}: {text}")
+
+
+def total(losses):
+    return sum(value for key, value in losses.items() if key.startswith("loss_"))
+
+
+def train(loss, data, updates=20):
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    order = torch.Generator().manual_seed(3)
+    for _ in range(updates):
+        minibatch = data[torch.randperm(len(data), generator=order)[:8]]
+        total(loss(minibatch)).backward()
+        optimizer.step()
+        optimizer.zero_grad()
 
 
 def estimated(loss, num_costs=1, seed=1):

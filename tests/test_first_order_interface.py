@@ -4,8 +4,8 @@ from functools import partial
 
 import pytest
 import torch
-from first_order import LOSSES, build, crpo, every_loss, step, train
-from on_policy import estimated
+from first_order import LOSSES, build, crpo, every_loss, step
+from on_policy import estimated, train
 from torchrl.objectives import A2CLoss, KLPENPPOLoss
 from torchrl.objectives.value import TD0Estimator
 

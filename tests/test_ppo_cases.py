@@ -9,13 +9,12 @@ from functools import partial
 
 import pytest
 import torch
+from on_policy import TRAINS, Heads, make_trunk
 from tensordict import TensorDict
 from tensordict.nn import (
     CompositeDistribution,
     NormalParamExtractor,
-    ProbabilisticTensorDictSequential,
     TensorDictModule,
-    TensorDictSequential,
     set_composite_lp_aggregate,
 )
 from torch import nn
@@ -28,13 +27,6 @@ from torchrl_safe.objectives import CostGAE, PPOLagrangianLoss
 from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
 from torchrl_safe.testing.networks import mlp
 
-# Each output and the network that it trains.
-TRAINS = {
-    "loss_objective": "actor",
-    "loss_entropy": "actor",
-    "loss_critic": "critic",
-    "loss_cost_critic": "cost_critic",
-}
 PARTS = [("moves", "arm"), ("moves", "gripper")]
 
 
@@ -43,18 +35,6 @@ def no_aggregation():
     """Log-probabilities of composite actions stay apart, as TorchRL recommends."""
     with set_composite_lp_aggregate(False):
         yield
-
-
-class Heads(nn.Module):
-    """A normal head and a categorical one."""
-
-    def __init__(self):
-        super().__init__()
-        self.body = mlp(OBSERVATION_SIZE, 5)
-
-    def forward(self, observation):
-        out = self.body(observation)
-        return out[..., :1], out[..., 1:2].exp(), out[..., 2:]
 
 
 def make_composite_actor(seed=0):
@@ -361,20 +341,7 @@ def test_keyword_calls_under_other_names(choice):
 @pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
 def test_a_trunk_that_actor_and_critics_share(separate, estimator):
     """Run by each of them: with separate losses only the policy trains it."""
-    torch.manual_seed(0)
-    trunk = TensorDictModule(nn.Linear(OBSERVATION_SIZE, 8), ["observation"], ["hidden"])
-    policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
-    head = ProbabilisticActor(
-        TensorDictModule(policy, ["hidden"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
-        return_log_prob=True,
-    )
-    actor = ProbabilisticTensorDictSequential(trunk, *head)
-    critic = TensorDictSequential(trunk, ValueOperator(nn.Linear(8, 1), in_keys=["hidden"]))
-    cost_critic = TensorDictSequential(
-        trunk, ValueOperator(nn.Linear(8, 2), in_keys=["hidden"], out_keys=["cost_value"])
-    )
+    (actor, critic, cost_critic), trunk = make_trunk(2)
     batch = make_batch(2)
     if estimator is not None:
         with torch.no_grad():
@@ -383,12 +350,13 @@ def test_a_trunk_that_actor_and_critics_share(separate, estimator):
     loss = PPOLagrangianLoss(
         actor, critic, cost_critic, num_costs=2, multiplier_init=0.5, separate_losses=separate
     )
+    assert len({id(p) for p in loss.parameters()}) == len([*loss.parameters()]) == 2 + 3 * 2
     losses = loss(batch)
     for key, network in TRAINS.items():
         loss.zero_grad()
-        trunk.module.weight.grad = None
+        trunk.weight.grad = None
         losses[key].backward(retain_graph=True)
-        trained = trunk.module.weight.grad is not None and bool(trunk.module.weight.grad.any())
+        trained = trunk.weight.grad is not None and bool(trunk.weight.grad.any())
         assert trained == (network == "actor" or not separate), key
 
 

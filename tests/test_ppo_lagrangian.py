@@ -1,6 +1,7 @@
 """PPOLagrangianLoss: what it shares with ClipPPOLoss and what it adds."""
 
 import re
+from functools import partial
 
 import pytest
 import torch
@@ -10,26 +11,19 @@ from on_policy import (
     assert_same_outputs,
     estimated,
     make_loss,
+    make_trunk,
     networks_with_gradient,
     parameters,
+    train,
 )
-from tensordict.nn import (
-    NormalParamExtractor,
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictSequential,
-)
-from torch import nn
 from torch.nn.functional import smooth_l1_loss
 from torchrl.collectors.utils import split_trajectories
-from torchrl.modules import IndependentNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss, SoftUpdate
 from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives import CostGAE, PPOLagrangianLoss, penalized_advantage
 from torchrl_safe.objectives.functional import centred
-from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
+from torchrl_safe.testing import check_equals_at_zero, make_batch, make_critic, make_networks
 
 
 def make_clip_loss(seed=0, **kwargs):
@@ -102,24 +96,12 @@ def test_multiplier_zero_is_clip_ppo_bit_for_bit(options, precomputed, num_costs
     ids=["default", "normalized-and-clipped", "not-functional"],
 )
 def test_multiplier_zero_trains_like_clip_ppo_bit_for_bit(options):
-    loss, clip_loss = make_loss(2, **options), make_clip_loss(**options)
+    """And trains the critic of the costs."""
+    check_equals_at_zero(partial(PPOLagrangianLoss, **options), partial(ClipPPOLoss, **options))
+    loss = make_loss(2, **options)
     before = [p.detach().clone() for p in parameters(loss, "cost_critic")]
-    start = [p.detach().clone() for p in parameters(loss, "actor")]
-    data = estimated(make_loss(2), 2)
-    for trained in (loss, clip_loss):
-        optimizer = torch.optim.Adam(trained.parameters(), lr=1e-2)
-        order = torch.Generator().manual_seed(3)
-        for _ in range(20):
-            minibatch = data[torch.randperm(len(data), generator=order)[:8]]
-            losses = trained(minibatch)
-            sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-            optimizer.step()
-            optimizer.zero_grad()
-    for network in ("actor", "critic"):
-        pairs = zip(parameters(loss, network), parameters(clip_loss, network), strict=True)
-        assert all(torch.equal(ours, theirs) for ours, theirs in pairs)
-    for old, now in ((start, "actor"), (before, "cost_critic")):
-        assert not any(map(torch.equal, old, parameters(loss, now)))
+    train(loss, estimated(loss, 2), updates=1)
+    assert not any(map(torch.equal, before, parameters(loss, "cost_critic")))
 
 
 # ---------------------------------------------------------------- the mixed objective
@@ -436,42 +418,6 @@ def test_each_loss_trains_one_network(name, precomputed, functional):
     assert networks_with_gradient(loss) == {TRAINS[name]}
 
 
-def make_shared(num_costs=2, **kwargs):
-    """A loss whose three networks share their first layer, and that layer."""
-    torch.manual_seed(0)
-    trunk = TensorDictModule(nn.Linear(OBSERVATION_SIZE, 8), ["observation"], ["hidden"])
-    policy = nn.Sequential(nn.Linear(8, 4), NormalParamExtractor())
-    actor = ProbabilisticTensorDictSequential(
-        trunk,
-        TensorDictModule(policy, ["hidden"], ["loc", "scale"]),
-        ProbabilisticTensorDictModule(
-            in_keys=["loc", "scale"],
-            out_keys=["action"],
-            distribution_class=IndependentNormal,
-            return_log_prob=True,
-        ),
-    )
-    critic = TensorDictSequential(trunk, ValueOperator(nn.Linear(8, 1), in_keys=["hidden"]))
-    cost_critic = TensorDictSequential(
-        trunk, ValueOperator(nn.Linear(8, num_costs), in_keys=["hidden"], out_keys=["cost_value"])
-    )
-    loss = PPOLagrangianLoss(actor, critic, cost_critic, num_costs=num_costs, **kwargs)
-    return loss, trunk.module
-
-
-@pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
-@pytest.mark.parametrize("name", TRAINS)
-def test_only_the_policy_trains_a_shared_trunk_with_separate_losses(name, separate):
-    loss, trunk = make_shared(separate_losses=separate)
-    names = [name for name, _ in loss.named_parameters()]
-    assert len(names) == len({id(p) for p in loss.parameters()}) == 2 + 3 * 2
-    losses = loss(estimated(loss, 2))
-    losses[name].backward()
-    reached = trunk.weight.grad is not None and bool(trunk.weight.grad.any())
-    # The entropy of this policy depends on its scale alone, which depends on the trunk.
-    assert reached == (TRAINS[name] == "actor" or not separate)
-
-
 @pytest.mark.parametrize("separate", [True, False], ids=["separate_losses", "joint"])
 @pytest.mark.parametrize("name", ["loss_critic", "loss_cost_critic"])
 def test_critics_train_no_encoder_outside_the_loss_with_separate_losses(name, separate):
@@ -483,8 +429,11 @@ def test_critics_train_no_encoder_outside_the_loss_with_separate_losses(name, se
 
 
 def test_separate_losses_change_no_value():
-    joint, _ = make_shared()
-    separate, _ = make_shared(separate_losses=True)
+    """test_ppo_cases.py has what a shared trunk is trained by."""
+    joint, separate = (
+        PPOLagrangianLoss(*make_trunk(2)[0], num_costs=2, separate_losses=each)
+        for each in (False, True)
+    )
     data = estimated(joint, 2)
     assert_same_outputs(separate(data), joint(data))
 
