@@ -166,10 +166,18 @@ def test_critics_and_targets_settle_at_the_discounted_cost(kind):
         )
 
 
-@each_loss
-def test_next_costs_are_those_of_the_action_that_the_reward_is_bootstrapped_with(kind):
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (SACLagrangianLoss, {}),
+        (SACLagrangianLoss, {"skip_done_states": True}),
+        (TD3LagrangianLoss, {}),
+    ],
+    ids=["sac", "sac-skips-done-states", "td3"],
+)
+def test_next_costs_are_those_of_the_action_that_the_reward_is_bootstrapped_with(kind, options):
     """With costs and rewards alike, and critics alike, the two losses are alike too."""
-    loss = make_loss(kind, 1, **NO_ENTROPY[kind])
+    loss = make_loss(kind, 1, **NO_ENTROPY[kind], **options)
     with torch.no_grad():
         for target in (False, True):
             pairs = zip(
