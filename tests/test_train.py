@@ -144,6 +144,7 @@ def test_help_is_short_and_grouped(capsys):
         command_line(["--help-all"])
     said = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "ppo-shield is ppo with a shield" in said
+    assert all(name in said for name in names)
 
 
 def test_a_shield_is_trained_with_beside_the_others():
