@@ -621,3 +621,22 @@ def test_is_for_environments(transform):
 def test_the_base_class_needs_its_rules():
     with pytest.raises(TypeError, match="abstract"):
         CostTally(1.0, start=0.0, cost_key="cost", reward_key="reward", out_key="tally")
+
+
+@pytest.mark.parametrize(
+    ("transform", "start"),
+    [(partial(Saute, 100.0, unsafe_reward=-7.0), 1.0), (partial(EarlyTermination, 100.0), 0.0)],
+    ids=["saute", "early"],
+)
+def test_a_reset_without_a_mask_begins_all_tallies_anew(make_env, transform, start):
+    """Also where what it is given has the tallies of the episodes before."""
+    env = make_env(inside, transform, 2)
+    following = env.step(env.rand_action(env.reset()))["next"].exclude("reward", "cost")
+    assert env.reset(following)[env.transform[-1].out_key].tolist() == [[start]] * 2
+
+
+def test_a_budget_is_copied():
+    budget = torch.tensor([0.5])
+    transform = EarlyTermination(budget)
+    budget.zero_()
+    assert transform.budget.tolist() == [0.5]

@@ -49,6 +49,13 @@ def test_the_last_two_and_the_best_are_kept(run, net):
     assert net.weight.unique().tolist() == [2]
 
 
+def test_a_score_of_zero_is_a_score(run, net):
+    best = save(run, net, 1, score=0.0)
+    for step in (2, 3, 4):
+        save(run, net, step, score=-1.0)
+    assert run.best() == best
+
+
 def test_as_many_are_kept_as_asked_for(tmp_path, net):
     run = RunCheckpoints(tmp_path, {"net": net}, keep_last=3)
     paths = [save(run, net, step) for step in range(5)]
@@ -104,12 +111,13 @@ def without_a_part(path):
 
 
 def of_another_network(path):
-    RunCheckpoints(path.parent, {"net": torch.nn.Linear(4, 2)}, settings={"arms": ["a", "b"]}).save(
-        2
-    )
+    path.unlink()
+    net = torch.nn.Linear(4, 2)
+    RunCheckpoints(path.parent, {"net": net}, settings={"arms": ["a", "b"]}).save(2)
 
 
 def of_another_run(path):
+    path.unlink()
     RunCheckpoints(path.parent, {"net": torch.nn.Linear(3, 2)}, settings={"arms": ["c"]}).save(2)
 
 
@@ -238,14 +246,20 @@ def test_what_a_killed_process_left_is_cleared_away(run, net):
     assert not left.parent.exists()
 
 
-def test_a_run_does_not_save_before_what_another_has_saved(run, net):
-    """The rotation keeps the highest steps: it would remove the new file at once."""
+def test_a_run_saves_neither_before_nor_over_what_another_has_saved(run, net):
+    """The rotation keeps the highest steps: it would remove the new file at once.
+
+    A run may save its own last step again.
+    """
     save(run, net, 90)
     other = RunCheckpoints(run.folder, {"net": net}, settings={"arms": ("c",)})
-    with pytest.raises(
-        ValueError, match=r"step must not be less .* got 10, .*-000000000090.torchrl"
-    ):
-        other.save(10)
+    for step in (10, 90):
+        with pytest.raises(
+            ValueError, match=rf"step must be more .* got {step}, .*-000000000090.torchrl"
+        ):
+            other.save(step)
+    assert run.load() == 90
+    save(run, net, 90)
     other.clear()
     assert other.save(10).exists()
     assert other.load() == 10

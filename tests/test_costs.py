@@ -55,13 +55,14 @@ def test_collision_without_obstacles_is_free():
 
 def test_collision_within_a_margin():
     """What is nearer in any substep counts, and so does a touch between two measurements."""
-    clearance = np.array([[[0.03], [0.02]], [[0.03], [0.021]], [[np.inf], [np.inf]]])
+    apart = [[np.inf], [np.inf]]
+    clearance = np.array([[[0.03], [0.02]], [[0.03], [0.021]], [[0.02], [0.03]], apart])
     state = make_state(
-        contact_distance=[[np.inf], [np.inf], [-0.001]],
-        contact_force=np.zeros((3, 1)),
+        contact_distance=[*apart, [np.inf], [-0.001]],
+        contact_force=np.zeros((4, 1)),
         trace={"clearance": clearance},
     )
-    np.testing.assert_array_equal(Collision(margin=0.02)(state), [1, 0, 1])
+    np.testing.assert_array_equal(Collision(margin=0.02)(state), [1, 0, 1, 1])
 
 
 @pytest.mark.parametrize("margin", [-0.01, float("inf"), float("nan")])

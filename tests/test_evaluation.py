@@ -12,6 +12,7 @@ from torchrl._utils import seed_generator
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import (
     Compose,
+    ExcludeTransform,
     GymWrapper,
     RenameTransform,
     RewardSum,
@@ -104,12 +105,22 @@ class Counting(gymnasium.Env):
         return np.ones(2, np.float32), 0.5, self.steps >= self.length, False, {}
 
 
-def test_any_environment_with_a_cost():
-    still = TensorDictModule(lambda observation: observation[..., :1], ["observation"], ["action"])
+def counting(*transforms):
     cost = RenameTransform(["observation"], ["cost"], create_copy=True)
-    plain = GymWrapper(Counting())
-    env = TransformedEnv(plain, Compose(cost, CostToReward()))
-    episodes = evaluate(env, still, 20, seed=0)
+    return TransformedEnv(GymWrapper(Counting()), Compose(cost, CostToReward(), *transforms))
+
+
+def keep_still(observation):
+    assert not torch.is_grad_enabled()
+    return observation[..., :1]
+
+
+STILL = TensorDictModule(keep_still, ["observation"], ["action"])
+
+
+def test_any_environment_with_a_cost():
+    env, plain = counting(), GymWrapper(Counting())
+    episodes = evaluate(env, STILL, 20, seed=0)
     assert set(episodes.keys()) == {"episode_reward", "episode_cost", "steps"}
     assert set(episodes["steps"].squeeze(-1).tolist()) == {1, 2, 3, 4, 5}
     torch.testing.assert_close(episodes["episode_reward"], 0.5 * episodes["steps"])
@@ -117,18 +128,28 @@ def test_any_environment_with_a_cost():
     assert list(summarize(episodes)) == [
         "return", "steps", "cost/0", "any/0", "cost/1", "any/1"
     ]  # fmt: skip
-    with pytest.raises(ValueError, match="max_steps must let every episode end, got 2, "):
-        evaluate(env, still, 20, seed=0, max_steps=2)
+    with pytest.raises(ValueError, match="max_steps must let every episode end, got 4, "):
+        evaluate(env, STILL, 20, seed=0, max_steps=4)
     with pytest.raises(ValueError, match="env must have the key 'cost' or 'episode_cost', got"):
-        evaluate(plain, still, 1, seed=0)
+        evaluate(plain, STILL, 1, seed=0)
     reader = default_info_dict_reader(["cost"], spec=Composite(cost=Unbounded(())))
     told = GymWrapper(Counting()).set_info_dict_reader(reader)
     with pytest.raises(ValueError, match=r"cost must have shape \(\*\(\), k\), got \(\)"):
-        evaluate(told, still, 1, seed=0)
+        evaluate(told, STILL, 1, seed=0)
     with pytest.raises(ValueError, match="episodes must be a whole number of at least 1, got 0"):
-        evaluate(env, still, 0, seed=0)
+        evaluate(env, STILL, 0, seed=0)
     with pytest.raises(ValueError, match=r"cost_names must be one for each of the 2 costs, got \("):
         summarize(episodes, ("one",))
+
+
+def test_an_episode_may_end_with_the_last_of_max_steps():
+    assert evaluate(counting(), STILL, 20, seed=0, max_steps=5)["steps"].max() == 5
+
+
+def test_the_sums_are_enough():
+    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
+    episodes = evaluate(counting(sums, ExcludeTransform("cost")), STILL, 20, seed=0)
+    torch.testing.assert_close(episodes["episode_cost"], episodes["steps"].float().expand(20, 2))
 
 
 def test_an_environment_comes_first(make_env):

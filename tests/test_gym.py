@@ -15,7 +15,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.monitor import Monitor
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
-from worlds import combinations
+from worlds import Places, combinations
 
 from torchrl_safe.envs import (
     PAPER_JOINT,
@@ -25,6 +25,8 @@ from torchrl_safe.envs import (
     JointDelta,
     MuJoCo,
     NoObstacles,
+    Shield,
+    Sphere,
 )
 from torchrl_safe.envs.gym import (
     ACTIONS,
@@ -316,6 +318,22 @@ def test_success_terminates():
     assert (terminated, truncated, info["is_success"]) == (True, False, True)
     assert len(before) < 39
     assert not any(info["is_success"] for *_, info in before)
+
+
+def test_the_info_tells_what_the_shield_has_done(turntable):
+    """A ball before the bar shortens the way; one on each side stops it."""
+    before, *beside = (0.45, 0.25, 0.5), (0.45, 0.16, 0.5), (0.45, -0.16, 0.5)
+    infos = []
+    for places in ([before], beside):
+        layout = Places(*(Sphere(0.1) for _ in places), at=places)
+        shield = Shield(margin=0.02, rate=5.0)
+        env = ArmGymEnv(**{**turntable, "obstacles": layout, "shield": shield})
+        env.reset()
+        infos.append(env.step(np.ones(1, np.float32))[-1])
+        env.close()
+    assert [info["shield_braked"] for info in infos] == [False, True]
+    assert 0.05 < infos[0]["shield_correction"] < 0.07
+    assert infos[1]["shield_correction"] == pytest.approx(0.1)
 
 
 def test_stable_baselines_learns_on_it():

@@ -138,12 +138,35 @@ def test_arms_at_home_are_out_of_reach_at_first(make_env, arm):
         assert not rest(env)["cost"].any()
 
 
+def test_an_elbow_is_not_folded_flat():
+    """A hand that is to pass nearer to the shoulder than 0.12 m stays so far away."""
+    human = Human(shoulder=(0.5, 0.05, 0.2), rest=(0.7, 0.1, 0.2))
+    shoulder, elbow, below_elbow, hand, _ = limbs(human)
+    np.testing.assert_allclose(elbow, below_elbow, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(hand - shoulder, axis=1).min(), 0.12)
+
+
+def test_each_reach_is_for_another_part_of_the_way():
+    human = Human(shoulder=(0.8, 0.3, 0.4), rest=(0.9, 0.25, 0.2))
+    *_, hand, _ = limbs(human)
+    still = np.linalg.norm(np.diff(hand, axis=0), axis=1) < 1e-9
+    away = np.linalg.norm(hand[1:] - human.rest, axis=1) > 1e-6
+    way = GOAL - START
+    along = (hand[1:][still & away] - START) @ way / (way @ way)
+    # One share of the way for all reaches, and up to 0.08 m off it, would be 0.73 at most.
+    assert np.ptp(along) > 0.75
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"shoulder": (1, 0)}, r"shoulder must have shape \(3,\), got \(2,\)"),
         ({"rest": (1, 0, np.nan)}, "rest must be finite"),
-        ({"rest": (0.4, 0.2, 0.4)}, r"rest must be within 0.62 m of the shoulder, .* is 0.700 m"),
+        (
+            {"rest": (0.4, 0.2, 0.4)},
+            r"rest must be 0.12 to 0.62 m from .* which is 0.700 m away",
+        ),
+        ({"rest": (1.1, 0.2, 0.35)}, r"rest must be 0.12 to 0.62 m from .* which is 0.050 m away"),
         ({"duration": (0, 1)}, "duration must be positive and finite, got 0"),
         ({"duration": 1.0}, r"duration must have shape \(2,\), got \(\)"),
         ({"duration": (2, 1)}, "duration must be shortest, longest, got 2.0, 1.0"),

@@ -286,3 +286,14 @@ def test_bad_placements(arguments, message):
 def test_bad_arguments(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_each_is_turned_by_itself():
+    x = np.broadcast_to([1.0, 0, 0], (3, 3))
+    turned = turn(Scattered(3).sample(np.random.default_rng(0), START, GOAL).orientation, x)
+    assert (np.abs(turned - np.roll(turned, 1, axis=0)).max(axis=1) > 0.1).all()
+
+
+def test_half_of_it_may_be_in_the_table():
+    (centre,) = InFront(height=0.0).sample(RNG, START, GOAL).position
+    assert centre[2] == 0

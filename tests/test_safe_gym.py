@@ -23,6 +23,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_safe.envs.gym import SafeGymEnv, SafeGymWrapper
+from torchrl_safe.envs.gym.autoreset import entries
 
 MODES = [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
 by_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
@@ -405,3 +406,33 @@ def test_wrong_keys(keys):
 def test_device_is_that_of_the_tensors(make_env):
     env = make_env(SafeGymWrapper, Counting(), device="cpu")
     assert env.rollout(2)["next", "cost"].device == torch.device("cpu")
+
+
+def test_only_the_step_before_tells_what_has_reset_itself(make_env):
+    """A step later the environments have moved on: what a reset gives then is a new beginning."""
+    both = vector(AutoresetMode.SAME_STEP, partial(Counting, 2), partial(Counting, 2))
+    env = make_env(SafeGymWrapper, both)
+    td = env.reset()
+    for _ in range(3):  # The second ends both episodes, and nobody resets them.
+        td = env.step(env.rand_action(td))["next"]
+    again = env.reset(td.set("_reset", torch.ones(2, 1, dtype=torch.bool)))
+    assert again["observation"].flatten().tolist() == [0, 0]
+    after = env.step(env.rand_action(again))["next"]
+    assert after["observation"].flatten().tolist() == [1, 1]
+
+
+def test_same_step_refuses_to_reset_another_than_what_is_done(make_env):
+    env = make_env(SafeGymWrapper, vector(AutoresetMode.SAME_STEP))
+    td = env.reset()
+    for _ in range(3):  # The second row ends.
+        td = env.step(env.rand_action(td))["next"]
+    assert td["done"].flatten().tolist() == [False, True]
+    with pytest.raises(RuntimeError, match="They reset themselves"):
+        env.reset(td.set("_reset", ~td["done"]))
+
+
+def test_an_old_info_names_those_that_have_an_entry():
+    """An array of dictionaries, which Gymnasium made before 1.0."""
+    found = entries(np.array([{"cost": 0.5}, {}, None], dtype=object))
+    assert found["cost"].tolist() == [0.5, 0, 0]
+    assert found["_cost"].tolist() == [True, False, False]

@@ -239,12 +239,54 @@ def test_at_the_radius_is_not_within_it(kind):
     np.testing.assert_array_equal(task.reward(state), [-1, 0])
 
 
+def test_the_way_of_pushing_of_any_shape():
+    """Behind the widest side, at the upper half; level, also where the object does not lie flat."""
+    goal = [[0.5, 0, 0.03], [0, 0.5, 0.03]]
+    place = np.array([[[0, 0, 0.03]], [[0, 0, 0.15]]])
+    # 0.04 m of half a box and 0.01 m of fingers before the box.
+    tool = place[:, 0] + [[-0.05, 0, 0.015], [0, -0.05, 0.015]]
+    state = make_state(goal=goal, object_position=place, ee_position=tool)
+    way = Push(shape=Box((0.02, 0.04, 0.03), mass=1.0))._way(state)
+    np.testing.assert_allclose(way, [0.5, np.hypot(0.5, 0.12)])
+
+
+@pytest.mark.parametrize(
+    ("tool", "openings", "goal", "way"),
+    [
+        # Far beside the box it need not be higher than 0.06 m.
+        ((0.3, 0, 0.06), (0.04, 0.04), (0.2, 0, 0), 0.5 + np.hypot(0.3, 0.06) + 3 * 0.02),
+        # Both fingers count, and those that are closed do not hold what is between them ...
+        ((0, 0, 0.01), (0.03, 0.01), (0.2, 0, 0), 0.2 + 0.01),
+        ((0, 0, 0.01), (0, 0), (0.2, 0, 0), 0.5 + 0.01 + 3 * 0.02),
+        # ... nor do those that are elsewhere, as wide as the box.
+        ((0, 0, 0.3), (0.02, 0.02), (0.2, 0, 0), 0.5 + 0.3 + 3 * 0.04),
+        # Held, and further from the goal than 0.5 m.
+        ((0, 0, 0.01), (0.02, 0.02), (0.9, 0, 0), 0.5 + 0.01),
+    ],
+    ids=["far-beside", "both-fingers", "closed", "elsewhere", "far-to-carry"],
+)
+def test_the_way_of_picking_up(tool, openings, goal, way):
+    """A box that is higher than wide: its width is what the fingers take."""
+    state = make_state(goal=[goal] * 2, ee_position=[tool] * 2, finger_position=[openings] * 2)
+    task = PickAndPlace(shape=Box((0.02, 0.02, 0.05), mass=0.1))
+    np.testing.assert_allclose(task._way(state), way)
+
+
+def test_goals_in_the_air_are_not_below_those_on_the_table():
+    task = PickAndPlace(Region((0.4, -0.3, 0.0), (0.8, 0.3, 0.04)), on_table=0.0)
+    rng = np.random.default_rng(0)
+    heights = [task.sample(rng, None)[0][2] for _ in range(200)]
+    assert min(heights) == 0.02
+    assert max(heights) > 0.035
+
+
 @pytest.mark.parametrize(
     ("arguments", "kind", "message"),
     [
         ({"radius": 0}, ValueError, "radius must be positive and finite, got 0"),
         ({"distance": np.nan}, ValueError, "distance must be positive and finite, got nan"),
         ({"radius": 0.5}, ValueError, "distance must be more than radius, 0.5, got 0.3"),
+        ({"radius": 0.3}, ValueError, "distance must be more than radius, 0.3, got 0.3"),
         ({"shape": Box()}, ValueError, r"shape must have a mass to be moved, got Box\("),
         ({"shape": None}, TypeError, "shape must be an instance of Cylinder or Box or"),
         ({"shape": "box"}, TypeError, "shape must be an instance of Cylinder or Box or"),

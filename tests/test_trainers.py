@@ -506,3 +506,33 @@ def test_a_trainer_that_sees_no_batches(make_arm):
     hook = MultiplierHook(DualAscent(make_loss(), cost_limit=1.0, lr=0.5))
     with pytest.raises(ValueError, match="collector must yield its batches"):
         hook.log(None)
+
+
+def test_ends_are_where_the_done_key_says(make_arm):
+    """No episode of ours is terminated; all are truncated, and cost more than their limit."""
+    moved = []
+    for key in ("terminated", "truncated"):
+        arm = make_arm()
+        arm.safe_trainer(done_key=key).train()
+        moved.append(arm.loss.lagrange_multiplier[1].item() > 0)
+    assert moved == [False, True]
+
+
+def test_frames_and_steps_are_those_asked_for(make_arm):
+    arm = make_arm()
+    trainer = ConstrainedPPOTrainer(
+        collector=arm.collector,
+        total_frames=FRAMES,
+        frame_skip=3,
+        optim_steps_per_batch=1,
+        num_epochs=1,
+        loss_module=arm.loss,
+        updater=arm.updater,
+        optimizer=arm.optimizer,
+        replay_buffer=arm.buffer,
+        progress_bar=False,
+    )
+    trainer.train()
+    assert trainer.collected_frames == 3 * FRAMES
+    (steps,) = {state["step"].item() for state in arm.optimizer.state.values()}
+    assert steps == 1

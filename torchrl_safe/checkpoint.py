@@ -77,6 +77,8 @@ class RunCheckpoints:
         self._checkpoint = _checkpoint_of(components)
         # What load has warned of, and why: the run goes on from before.
         self._skipped: dict[Path, str] = {}
+        # What this run has written or loaded last.
+        self._newest: Path | None = None
 
     def save(self, step: int, *, score: float | None = None) -> Path:
         """Saves all components.
@@ -92,7 +94,7 @@ class RunCheckpoints:
 
         Raises:
             ValueError: if ``step`` is not a whole number of at most twelve digits, or the folder
-                has checkpoints of later steps: this one would not be the newest.
+                has a checkpoint of a later step, or one of this step that another run has left.
             OSError: if it could not be written, for example because the disk is full; those
                 before are intact. What a ``state_dict`` raises is raised as it is.
         """
@@ -102,10 +104,12 @@ class RunCheckpoints:
                 f"step must be a whole number of at least 0, got {step!r}, and at most 12 digits."
             )
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
-        later = [file for file in self._files() if file.name > path.name]
-        if foreign := [file.name for file in later if file not in self._skipped]:
+        # A run may write its own last checkpoint again.
+        kept = self._newest if self._newest == path else None
+        rest = [file for file in self._files() if file.name >= path.name and file != kept]
+        if foreign := [file.name for file in rest if file not in self._skipped]:
             raise ValueError(
-                f"step must not be less than that of the newest checkpoint, got {step}, and "
+                f"step must be more than that of the newest checkpoint, got {step}, and "
                 f"{self.folder} has {foreign[-1]}: load() resumes that run, clear() removes it."
             )
         parts = self._checkpoint.components
@@ -127,9 +131,11 @@ class RunCheckpoints:
             ) from error
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
-        for file in later:
-            file.unlink()
+        for file in rest:
+            if file != path:
+                file.unlink()
         self._rotation.prune()
+        self._newest = path
         return path
 
     def load(self, *, map_location: Any = None) -> int | None:
@@ -154,6 +160,7 @@ class RunCheckpoints:
             except Exception as error:  # A torn file can raise any error in its readers.
                 self._skipped[path] = f"{path}: {error}"
                 continue
+            self._newest = path
             if self._skipped:
                 reasons = "\n".join(self._skipped.values())
                 warnings.warn(f"Going on from {path}; not used:\n{reasons}", stacklevel=2)

@@ -85,8 +85,10 @@ class CartesianDelta:
             per unit of action: 1 opens them by that much, 0 or less closes them.
 
     Raises:
+        TypeError: if ``inverse_kinematics`` is not callable.
         ValueError: if ``bound`` or a step is not positive, a finite ``bound`` is too large for
-            float32, ``orientation`` is not a unit quaternion, or both yaw and rotation are given.
+            float32, ``orientation`` is not a unit quaternion, or ``rotation_step`` is given beside
+            ``yaw_step`` or ``orientation``.
 
     Examples:
         >>> CartesianDelta(step=0.03).width(num_joints=7)
@@ -174,6 +176,7 @@ class JointDelta:
             unit of action: 1 opens them by that much, 0 or less closes them.
 
     Raises:
+        TypeError: if ``respect_limits`` is not True or False.
         ValueError: if ``step``, ``bound`` or ``finger_step`` is not positive, or a finite ``bound``
             is too large for float32.
 

@@ -48,8 +48,8 @@ class Human:
         pause: shortest and longest wait before and after a reach, s.
 
     Raises:
-        ValueError: if an argument has the wrong shape, a time is not positive, or the arm is
-            too short to rest its hand there.
+        ValueError: if an argument has the wrong shape, a time is not positive, or ``rest`` is
+            further from the shoulder than the arm is long, or nearer than it can bend.
 
     Examples:
         >>> placement = Human().sample(np.random.default_rng(0), np.zeros(3), np.ones(3))
@@ -71,10 +71,10 @@ class Human:
             if shortest > longest:
                 raise ValueError(f"{name} must be shortest, longest, got {shortest}, {longest}.")
         length = np.linalg.norm(rest - shoulder)
-        if length > _REACH:
+        if not _NEAREST <= length <= _REACH:
             raise ValueError(
-                f"rest must be within {_REACH} m of the shoulder, got {self.rest}, which is "
-                f"{length:.3f} m away."
+                f"rest must be {_NEAREST} to {_REACH} m from the shoulder, got {self.rest}, which "
+                f"is {length:.3f} m away."
             )
 
     @property

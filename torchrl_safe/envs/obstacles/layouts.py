@@ -42,6 +42,7 @@ class Placement:
             leaves them where they are, or to physics.
 
     Raises:
+        TypeError: if ``path`` is not callable.
         ValueError: if something has the wrong shape or is not finite, or an orientation is not a
             unit quaternion.
 
@@ -166,6 +167,7 @@ class InFront:
         height: height of the obstacle's centre, m. ``None`` stands it on the table.
 
     Raises:
+        TypeError: if ``shape`` is not a shape.
         ValueError: if ``gap`` leaves the goal inside the obstacle or ``direction`` is not
             horizontal.
         NoRoomError: in :meth:`sample`, if the goal is no further than ``gap`` from the start.
@@ -235,6 +237,7 @@ class Scattered:
         spacing: smallest horizontal distance between two obstacles, m.
 
     Raises:
+        TypeError: if ``region`` or ``shape`` is not of its kind.
         ValueError: if an argument is not usable.
         NoRoomError: in :meth:`sample`, if the region has no room for ``count`` obstacles beside
             start and goal.
