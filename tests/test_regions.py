@@ -55,7 +55,7 @@ def test_points_may_be_lists_arrays_and_tensors(give):
         (InFront, {"direction": point}),
         (Swing, {"direction": point}),
         (Patrol, {"direction": point}),
-        (Human, {"shoulder": beyond, "rest": (0.6, 0.25, 0.2), "pause": (0.5, 1.0)}),
+        (Human, {"shoulder": beyond, "rest": (0.625, 0.25, 0.25), "pause": (0.5, 1.0)}),
         (Region, {"low": point, "high": beyond}),
         (Camera, {"eye": point, "target": beyond}),
         (CartesianDelta, {"orientation": (0.0, 0.0, 0.0, 1.0)}),
