@@ -104,10 +104,10 @@ class RunCheckpoints:
                 f"step must be a whole number of at least 0, got {step!r}, and at most 12 digits."
             )
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
-        # A run may write its own last checkpoint again.
-        kept = self._newest if self._newest == path else None
-        rest = [file for file in self._files() if file.name >= path.name and file != kept]
-        if foreign := [file.name for file in rest if file not in self._skipped]:
+        later = [file for file in self._files() if file.name > path.name]
+        # A run may write its own last checkpoint again, and no other run's.
+        others = [path, *later] if path.exists() and path != self._newest else later
+        if foreign := [file.name for file in others if file not in self._skipped]:
             raise ValueError(
                 f"step must be more than that of the newest checkpoint, got {step}, and "
                 f"{self.folder} has {foreign[-1]}: load() resumes that run, clear() removes it."
@@ -131,9 +131,8 @@ class RunCheckpoints:
             ) from error
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
-        for file in rest:
-            if file != path:
-                file.unlink()
+        for file in later:
+            file.unlink()
         self._rotation.prune()
         self._newest = path
         return path
