@@ -13,8 +13,8 @@ import pytest
 import torch
 from bullet_worlds import worlds_of
 from scripted import fly, go, straight
-from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
+from worlds import step
 
 from torchrl_safe.envs import (
     PAPER_CARTESIAN,
@@ -24,10 +24,6 @@ from torchrl_safe.envs import (
     Speed,
     paper_env,
 )
-
-
-def step(env, action):
-    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
 
 
 def still(env):

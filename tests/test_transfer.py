@@ -14,6 +14,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import MLP
+from worlds import step
 
 from experiments import transfer
 from experiments.algorithms import ALGORITHMS
@@ -41,11 +42,6 @@ from torchrl_safe.policy import save_policy
 NAME = "panda-reach-human"
 LIMIT = SUITE[NAME].cost_limits["separation"]
 FAST = MuJoCo(threads=1)
-
-
-def step(env, action):
-    action = torch.tensor(action).expand(env.action_spec.shape)
-    return env.step(TensorDict({"action": action.clone()}, batch_size=env.batch_size))["next"]
 
 
 def moved(make_env, **scene):
