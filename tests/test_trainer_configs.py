@@ -44,6 +44,12 @@ def example(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """The logger of a configuration makes its folder where the process is."""
+    monkeypatch.chdir(tmp_path)
+
+
 def read(folder, *overrides):
     with initialize_config_dir(str(folder), version_base="1.3"):
         return compose("config", overrides=list(overrides))
