@@ -176,8 +176,6 @@ def main(config: Config) -> dict[str, Any]:
         frames=config.frames,
         frames_per_batch=config.frames_per_batch,
         seed=config.seed,
-        # The wide noise of the default is itself faster than that.
-        first_log_std=-1.0,
     )
     env = make_env(num_envs=8)
     training = ALGORITHMS["ppo-lagrangian"].build(env, settings)
