@@ -295,10 +295,7 @@ _SHIELD = Shield(margin=0.0075, rate=40.0, table=0.015, acceleration=20.0)
 ALGORITHMS: dict[AlgorithmName, Algorithm] = {
     "ppo": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, compiles=True),
     "ppo-shield": OnPolicy(
-        _of_ppo(PPOLagrangianLoss),
-        keep_multiplier,
-        compiles=True,
-        shield=_SHIELD,
+        _of_ppo(PPOLagrangianLoss), keep_multiplier, compiles=True, shield=_SHIELD
     ),
     "ppo-lagrangian-shield": OnPolicy(_of_ppo(PPOLagrangianLoss), compiles=True, shield=_SHIELD),
     "ppo-lagrangian": OnPolicy(_of_ppo(PPOLagrangianLoss), compiles=True),
@@ -341,15 +338,9 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         # It swings about what it is told, above the limit as often as below.
         partial(tell_violation, errors=1.0),
     ),
-    "ppo-saute": OnPolicy(
-        _of_ppo(PPOLagrangianLoss),
-        keep_multiplier,
-        transforms=_with_budget,
-    ),
+    "ppo-saute": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, transforms=_with_budget),
     "ppo-early-termination": OnPolicy(
-        _of_ppo(PPOLagrangianLoss),
-        keep_multiplier,
-        training_transforms=_terminating,
+        _of_ppo(PPOLagrangianLoss), keep_multiplier, training_transforms=_terminating
     ),
     "sac-lagrangian": OffPolicy(SACLagrangianLoss, stochastic=True, settings={"frames": 192_000}),
     "td3-lagrangian": OffPolicy(

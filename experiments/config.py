@@ -330,7 +330,7 @@ TASKS: dict[str, type] = {"reach": Reach, "push": Push, "pick-and-place": PickAn
 # What differs between reaching, pushing and picking up; within a kind of task nothing does.
 KINDS: dict[type, dict[str, Any]] = {Reach: {}, Push: _PUSHING, PickAndPlace: _PICKING}
 
-# The noise that is left in the end frees an arm that is in contact.
+# Less noise in the end than otherwise, but some: without any, an arm in contact would stay there.
 _SUITE_KINDS = {**KINDS, Reach: {**_LARGE, "last_log_std": -2.0}}
 # A policy may cost more without its noise, and a mean of 256 episodes is off by a fifth.
 _SUITE_LIMIT_SHARE = 0.7
