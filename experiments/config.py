@@ -142,7 +142,7 @@ class Config:
     frames_per_batch: int = 1024
     """Control steps between two updates of the policy."""
     epochs: int = 10
-    """Passes over each batch."""
+    """Passes over each batch; not off policy, where batches come from replay."""
     minibatch: int = 256
     """Control steps in a minibatch."""
     learning_rate: float = 5e-4
@@ -155,7 +155,8 @@ class Config:
     """Units in each of the two hidden layers of every network."""
     # Wide noise exceeds a small limit by itself. Multipliers then rise before the task is learnt.
     first_log_std: float = -1.0
-    """Logarithm of the policy's standard deviation at the start, before the squashing."""
+    """Logarithm of the policy's standard deviation at the start, before the squashing. Algorithms
+    that learn off policy have noise of their own."""
     last_log_std: float = -1.5
     """The same at the end; it moves from one to the other linearly."""
     gamma: float = 0.97
