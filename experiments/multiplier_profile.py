@@ -149,22 +149,21 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
 
 
 def _draw_front(axis: Axes, fixed: dict[float, np.ndarray]) -> None:
-    """Every seed of the fixed multipliers; a line joins their medians, which have names."""
+    """Every seed of the fixed multipliers; a line joins their medians, whose ends have names."""
     middle = np.array([np.median(rows, axis=0) for rows in fixed.values()])
     axis.plot(middle[:, 1], middle[:, 0], "-", color=GREY, lw=1, zorder=1)
-    for value, rows in fixed.items():
+    for rows in fixed.values():
         axis.plot(rows[:, 1], rows[:, 0], "o", color=GREY, ms=4, zorder=2)
-        reward, cost, *_ = np.median(rows, axis=0)
-        last = value == max(fixed)
-        axis.annotate(
-            f"multiplier fixed at {value:g}" if last else f"{value:g}",
-            (cost, reward),
-            xytext=(5, 5) if last else (0, 6),
-            rotation=0 if last else 60,  # Costs of small multipliers are close together.
-            textcoords="offset points",
-            color=GREY,
-            fontsize=8,
-        )
+    for (reward, cost, *_), value in zip(middle, fixed, strict=True):
+        if value in (min(fixed), max(fixed)):
+            axis.annotate(
+                f"fixed at {value:g}",
+                (cost, reward),
+                xytext=(5, 5),
+                textcoords="offset points",
+                color=GREY,
+                fontsize=8,
+            )
 
 
 def main(config: Config) -> None:
