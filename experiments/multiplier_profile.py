@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from itertools import cycle, product, zip_longest
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,7 @@ from experiments.config import Action, AlgorithmName, Config as TrainConfig, Eng
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.style import GREY, colour, cost_axis, figure_style, limit_line
 
-RULES: tuple[MultiplierRule, ...] = ("dual-ascent", "pid")
-_TITLES = {"dual-ascent": "DualAscent", "pid": "PIDControl"}
+RULES: dict[MultiplierRule, str] = {"dual-ascent": "DualAscent", "pid": "PIDControl"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,13 +107,12 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
     found = points(runs)
     fixed = {value: rows for (rule, value), rows in found.items() if rule == "fixed"}
     limits = sorted({value for rule, value in found if rule != "fixed"})
-    rules = [rule for rule in RULES if any(key[0] == rule for key in found)]
     most = max(rows[:, 1].max() for rows in found.values())
     with figure_style():
         figure, grid = plt.subplots(
             1,
-            max(len(rules), 1),
-            figsize=(4.6 * max(len(rules), 1), 3.6),
+            len(RULES),
+            figsize=(4.6 * len(RULES), 3.6),
             sharex=True,
             sharey=True,
             squeeze=False,
@@ -123,27 +121,26 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
         cost_axis(grid[0, 0], "x", most)
         grid[0, 0].set(xlim=(-0.03, 1.7 * most), ylabel="return")
         grid[0, 0].margins(y=0.12)  # Room for names.
-        for axis, rule in zip_longest(grid[0], rules):
+        for axis, (rule, title) in zip(grid[0], RULES.items(), strict=True):
             _draw_front(axis, fixed)
-            axis.set(xlabel="cost of an evaluated episode", title=_TITLES.get(rule, ""))
+            axis.set(xlabel="cost of an evaluated episode", title=title)
             for limit in limits:
                 limit_line(axis, limit, vertical=True, text=f"limit {limit:g}", shade=False)
             for limit, marker in zip(limits, cycle("osD^v"), strict=False):
-                rows = found.get((rule, limit), np.zeros((0, 4)))
+                rows = found[rule, limit]
                 axis.plot(
                     rows[:, 1], rows[:, 0], marker, ms=6, color=colour("ppo-lagrangian"), alpha=0.8
                 )
-                if len(rows):
-                    axis.annotate(
-                        f"told to keep {limit:g}",
-                        (rows[:, 1].mean(), rows[:, 0].min()),
-                        xytext=(0, -16),
-                        textcoords="offset points",
-                        ha="center",
-                        color=colour("ppo-lagrangian"),
-                        fontweight="bold",
-                        fontsize=8,
-                    )
+                axis.annotate(
+                    f"told to keep {limit:g}",
+                    (rows[:, 1].mean(), rows[:, 0].min()),
+                    xytext=(0, -16),
+                    textcoords="offset points",
+                    ha="center",
+                    color=colour("ppo-lagrangian"),
+                    fontweight="bold",
+                    fontsize=8,
+                )
         figure.savefig(path)
         plt.close(figure)
 

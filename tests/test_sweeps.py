@@ -76,16 +76,16 @@ def test_sweep_counts_the_seeds_that_keep_the_limit():
 
 
 @pytest.mark.slow
-def test_profile_runs_fixed_multipliers(tmp_path):
-    config = multiplier_profile.Config(**SMALL, multipliers=(4.0,), limits=(), out=tmp_path)
+def test_profile_runs_fixed_multipliers_and_rules(tmp_path):
+    config = multiplier_profile.Config(**SMALL, multipliers=(4.0,), limits=(0.5,), out=tmp_path)
     multiplier_profile.main(config)
-    (run,) = json.loads((tmp_path / "results.json").read_text())["runs"]
-    assert (run["rule"], run["value"]) == ("fixed", 4.0)
-    assert {row["multiplier/collision"] for row in run["history"]} == {4.0}
-    config = dataclasses.replace(config, limits=(0.5,), seeds=(0, 1))
-    assert [path.name for path in missing(multiplier_profile.jobs(config))] == [
-        "dual-ascent-0.5-0.json", "pid-0.5-0.json",
-        "fixed-4-1.json", "dual-ascent-0.5-1.json", "pid-0.5-1.json",
+    fixed, *others = json.loads((tmp_path / "results.json").read_text())["runs"]
+    assert (fixed["rule"], fixed["value"]) == ("fixed", 4.0)
+    assert {row["multiplier/collision"] for row in fixed["history"]} == {4.0}
+    assert [(run["rule"], run["value"]) for run in others] == [("dual-ascent", 0.5), ("pid", 0.5)]
+    config = dataclasses.replace(config, limits=(0.5, 2.0), seeds=(0, 1))
+    assert [path.name for path in missing(multiplier_profile.jobs(config))][:3] == [
+        "dual-ascent-2-0.json", "pid-2-0.json", "fixed-4-1.json",
     ]  # fmt: skip
 
 
