@@ -43,12 +43,14 @@ def collector(kind: Callable[..., BaseCollector], workers: int, worlds: int) -> 
     env = make_env(1)
     actor = make_agent(env, gamma=0.97).actor
     env.close()
-    return kind(
+    made = kind(
         [partial(make_env, worlds // workers)] * workers,
         actor,
         frames_per_batch=16 * worlds,
         total_frames=10**9,
     )
+    made.update_policy_weights_(actor)  # A RayCollector asks for it.
+    return made
 
 
 def workers(quick: bool) -> Iterator[Figure]:
