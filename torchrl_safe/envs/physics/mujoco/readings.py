@@ -154,22 +154,32 @@ def nearest(closest: Array, motions: Array, ways: Ways) -> dict[str, Array]:
         motions: centre, velocity and angular velocity of each shape's body, ``(..., g, 3, 3)``.
         ways: the obstacles at the same time, ``(..., m, width)``.
     """
+    # Mostly nothing is within reach. All the rest is computed only where something is.
+    near = np.any(closest, axis=(-3, -2, -1))
+    closest, motions = closest[near], motions[np.nonzero(near)[:-1]]
+    position, velocity, spin = (
+        part[near] for part in (ways.position, ways.velocity, ways.angular_velocity)
+    )
     way = closest[..., 1, :] - closest[..., 0, :]
     apart = np.sqrt(np.einsum("...i,...i->...", way, way))
     # Where they overlap, the two points have changed sides.
-    inwards = ways.position[..., None, :] - closest[..., 1, :]
+    inwards = position[:, None] - closest[..., 1, :]
     apart = np.where(np.einsum("...i,...i->...", inwards, way) < 0, -apart, apart)
     apart = np.where(apart == 0, np.inf, apart)
-    shape = apart.argmin(axis=-1)[..., None]
-    clearance = np.take_along_axis(apart, shape, axis=-1)
-    normal = np.take_along_axis(way, shape[..., None], axis=-2)[..., 0, :] / clearance
-    points = np.take_along_axis(closest, shape[..., None, None], axis=-3)[..., 0, :, :]
-    moves = np.take_along_axis(motions, shape[..., None], axis=-3)
-    centre, velocity, spin = (moves[..., part, :] for part in range(3))
-    arm = velocity + cross(spin, points[..., 0, :] - centre)
-    obstacle = ways.velocity + cross(ways.angular_velocity, points[..., 1, :] - ways.position)
-    return {
-        "clearance": clearance[..., 0],
-        "arm_approach": np.einsum("...i,...i->...", arm, normal),
-        "obstacle_approach": -np.einsum("...i,...i->...", obstacle, normal),
+    rows, shape = np.arange(len(apart)), apart.argmin(axis=1)
+    clearance = apart[rows, shape]
+    normal = way[rows, shape] / clearance[:, None]
+    on_arm, on_obstacle = np.moveaxis(closest[rows, shape], 1, 0)
+    centre, moving, turning = np.moveaxis(motions[rows, shape], 1, 0)
+    arm = moving + cross(turning, on_arm - centre)
+    met = velocity + cross(spin, on_obstacle - position)
+    found = {
+        "clearance": (np.inf, clearance),
+        "arm_approach": (0.0, np.einsum("...i,...i->...", arm, normal)),
+        "obstacle_approach": (0.0, -np.einsum("...i,...i->...", met, normal)),
     }
+    trace = {}
+    for name, (beyond, values) in found.items():
+        trace[name] = np.full(near.shape, beyond)
+        trace[name][near] = values
+    return trace
