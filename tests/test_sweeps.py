@@ -84,8 +84,10 @@ def test_profile_runs_fixed_multipliers_and_rules(tmp_path):
     assert {row["multiplier/collision"] for row in fixed["history"]} == {4.0}
     assert [(run["rule"], run["value"]) for run in others] == [("dual-ascent", 0.5), ("pid", 0.5)]
     config = dataclasses.replace(config, limits=(0.5, 2.0), seeds=(0, 1))
-    assert [path.name for path in missing(multiplier_profile.jobs(config))][:3] == [
-        "dual-ascent-2-0.json", "pid-2-0.json", "fixed-4-1.json",
+    assert [path.name for path in missing(multiplier_profile.jobs(config))] == [
+        "dual-ascent-2-0.json", "pid-2-0.json",
+        "fixed-4-1.json", "dual-ascent-0.5-1.json", "dual-ascent-2-1.json",
+        "pid-0.5-1.json", "pid-2-1.json",
     ]  # fmt: skip
 
 
