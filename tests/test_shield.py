@@ -344,6 +344,21 @@ def test_with_half_of_its_margin_gone_an_arm_only_withdraws(make_env, engine, tu
     assert state.joint_position[0, 0] == pytest.approx(-10 * 0.05**2, rel=0.05)
 
 
+def test_an_arm_that_withdraws_does_not_press_its_tool_down(make_env, engine):
+    """From a ball before and above the hand the shortest way leads back and down."""
+    layout = Places(Sphere(0.05), at=[(0.445, 0.0, 0.3)])
+    env = make_env(ArmEnv, action=CartesianDelta(), obstacles=layout, shield=Shield(), seed=0)
+    env.reset()
+    height, found = env.arm_state.ee_position[0, 2], []
+    for _ in range(2):
+        assert step(env, DOWN)["shield_braked"].item()
+        state = env.arm_state
+        assert state.ee_position[0, 2] == pytest.approx(height, abs=1e-3)
+        near = env._simulator.nearest(np.arange(1), state.joint_position, state.finger_position)
+        found.append(near.distance.min())
+    assert 0.005 < found[0] < 0.01 < found[1]
+
+
 def test_the_tool_stays_in_its_workspace(make_env, engine):
     region = Region((0.2, -0.1, 0.1), (0.5, 0.1, 0.4))
     shield = Shield(workspace=region)

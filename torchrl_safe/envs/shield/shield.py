@@ -52,7 +52,7 @@ class _Pairs(NamedTuple):
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
     joints: Array
     fingers: Array
-    #: Numbers of the obstacles, then of the table and of the walls, ``(r,)``.
+    #: Numbers of the obstacles, then of the table, then of what holds for the tool, ``(r,)``.
     other: NDArray[np.int_]
 
     def of(self, rows: NDArray[np.int_]) -> _Pairs:
@@ -109,7 +109,8 @@ class Shield:
     If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
     motion that does not use up more than all the room. If there is none, it stands still, or gives
     way to what comes as far as what stands allows. An arm with less than half of a margin left
-    brakes too: it only withdraws, whatever is asked for.
+    brakes too: it only withdraws, whatever is asked for, and its tool does not go down if
+    it can withdraw otherwise.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -211,8 +212,8 @@ class Shield:
         opening = fingers - held if fingers.shape[1] else np.zeros_like(held)
         step = _Step(state, simulator, duration, 1 - np.exp(-self.rate * duration))
         near = self._measure(step, np.arange(len(angles)), angles, held)
-        now = self._with_walls(step, near)
         pressed = self._is_pressed(state, near)
+        now = self._with_tool(step, near, pressed)
         asked = np.where(pressed[:, None], 0.0, joints - angles)
         lower, upper = self._bounds(step, now, longest)
         least = self._least(step, now)
@@ -330,18 +331,29 @@ class Shield:
             np.clip(turning + slack, lower, np.minimum(upper, _FAR)),
         )
 
-    def _with_walls(self, step: _Step, near: _Pairs) -> _Pairs:
-        """Adds the walls of the workspace, from which the tool point keeps away."""
-        if self.workspace is None:
+    def _with_tool(self, step: _Step, near: _Pairs, pressed: NDArray[np.bool_]) -> _Pairs:
+        """Adds what holds for the tool point: the walls of the workspace, from which it keeps away.
+
+        The tool of a pressed arm does not go down. It may be on an object, which the shield does
+        not see and whose friction would hold the arm.
+        """
+        walls = self.workspace
+        if walls is None and not pressed.any():
             return near
-        tool, walls = step.state.ee_position, self.workspace
         linear = step.simulator.jacobian(step.state.joint_position)[:, :3]
-        room = np.concatenate([tool - walls.low, walls.high - tool], axis=1) - self.margin
-        joints = np.concatenate([linear, -linear], axis=1)
+        joints = linear[:, 2:]
+        room, spare = np.full((2, len(pressed), 1), np.inf)
+        spare[pressed] = 0
+        if walls is not None:
+            tool, ways = step.state.ee_position, np.concatenate([linear, -linear], axis=1)
+            left = np.concatenate([tool - walls.low, walls.high - tool], axis=1) - self.margin
+            room = np.concatenate([room, left], axis=1)
+            spare = np.concatenate([spare, self._spare(step, left, ways)], axis=1)
+            joints = np.concatenate([joints, ways], axis=1)
         number = step.state.obstacle_position.shape[1] + 1
         return _Pairs(
             room=np.concatenate([near.room, room], axis=1),
-            spare=np.concatenate([near.spare, self._spare(step, room, joints)], axis=1),
+            spare=np.concatenate([near.spare, spare], axis=1),
             closing=np.concatenate([near.closing, np.zeros_like(room)], axis=1),
             joints=np.concatenate([near.joints, joints], axis=1),
             fingers=np.pad(near.fingers, [(0, 0), (0, room.shape[1]), (0, 0)]),
