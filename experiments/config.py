@@ -258,9 +258,9 @@ class Config:
         for name in others if given else ():
             value, field = getattr(self, name), defaults[name]
             own = field.default if field.default_factory is dataclasses.MISSING else {}
-            if value != own and option == "suite_task":
+            if value != own and option in ("suite_task", "costs"):
                 raise ValueError(
-                    f"{name} must not be given with suite_task, which sets it, got {value}."
+                    f"{name} must not be given with {option}, which sets it, got {value}."
                 )
             if value != own:
                 raise ValueError(f"{name} must be {own} with {option}, got {value}.")

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from tensordict import TensorDict
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import EnvBase, GymWrapper, Transform, TransformedEnv
 
 FLAGS = ("done", "terminated", "truncated")
 
@@ -131,3 +131,22 @@ class CountingBatch(EnvBase):
 
     def _set_seed(self, seed):
         pass
+
+
+class Flag(Transform):
+    """A cost that is true in each step, and no number."""
+
+    def _step(self, tensordict, next_tensordict):
+        return next_tensordict.set("cost", torch.ones(1, dtype=torch.bool))
+
+    def transform_reward_spec(self, reward_spec):
+        reward_spec["cost"] = Binary(shape=(1,), dtype=torch.bool)
+        return reward_spec
+
+
+def flagged(*transforms):
+    """A single :class:`Counting` whose cost is a flag."""
+    env = TransformedEnv(GymWrapper(Counting()), Flag())
+    for transform in transforms:
+        env.append_transform(transform)
+    return env

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from counting import CountingBatch
+from counting import CountingBatch, flagged
 from tensordict import TensorDict
 from torch.testing import assert_close
 from torchrl.collectors import Collector
@@ -123,6 +123,14 @@ def test_a_budget_that_is_just_used_up_is_not_exceeded_by_rounding(budget):
         left = saute.advance(left, torch.ones(1, 1))
         assert not saute.is_spent(left)
     assert saute.is_spent(saute.advance(left, torch.full((1, 1), 1e-3 * budget)))
+
+
+def test_flags_use_up_a_budget_like_numbers():
+    env = flagged(Saute(2.5, unsafe_reward=-7.0))
+    check_env_specs(env)
+    assert_close(env.rollout(3)["next", "remaining_budget"], torch.tensor([[0.6], [0.2], [-0.2]]))
+    env = flagged(EarlyTermination(2.5))
+    assert_close(env.rollout(3)["next", "accumulated_cost"], torch.tensor([[1.0], [2.0], [3.0]]))
 
 
 def test_each_cost_has_its_budget():

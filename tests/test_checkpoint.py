@@ -285,6 +285,23 @@ def test_steps_are_whole_numbers(run, step):
         run.save(step)
 
 
+@pytest.mark.parametrize("score", ["5", True, [1.0]])
+def test_scores_are_numbers(run, score):
+    with pytest.raises(ValueError, match="score must be a number, got"):
+        run.save(1, score=score)
+
+
+def test_components_have_names(tmp_path, net):
+    with pytest.raises(TypeError, match=r"components must be an instance of Mapping, got \["):
+        RunCheckpoints(tmp_path, [net])
+
+
+def test_a_component_that_was_saved_must_be_loaded(tmp_path, net):
+    RunCheckpoints(tmp_path, {"net": net, "updater": net}).save(1)
+    with pytest.raises(CheckpointError, match=r"components must have \['updater'\] too, which it"):
+        RunCheckpoints(tmp_path, {"net": net}).load()
+
+
 def test_settings_that_are_nan_are_the_same(tmp_path, net):
     settings = {"lr": float("nan"), "inner": {"rate": float("nan")}}
     RunCheckpoints(tmp_path, {"net": net}, settings=settings).save(1)

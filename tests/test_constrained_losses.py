@@ -359,6 +359,8 @@ def test_single_steps_have_no_advantages_to_estimate(make):
     before = copy.deepcopy(loss.state_dict())
     with pytest.raises(ValueError, match=r"must have a dimension of time .* shape \(24,\)"):
         loss(steps)
+    with pytest.raises(ValueError, match=r"must have a dimension of time .* shape \(24,\)"):
+        loss.estimate_advantages(steps)
     for key, value in loss.state_dict().items():
         assert torch.equal(value, before[key]), key
     trajectory = make_batch(2)[0]

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from counting import flagged
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl._utils import seed_generator
@@ -146,6 +147,13 @@ def test_an_episode_may_end_with_the_last_of_max_steps():
     assert evaluate(counting(), STILL, 20, seed=0, max_steps=5)["steps"].max() == 5
 
 
+def test_flags_are_counted():
+    assert evaluate(flagged(), STILL, 2, seed=0)["episode_cost"].tolist() == [[4.0], [4.0]]
+    summed = flagged(RewardSum(["cost"], ["episode_cost"]))
+    with pytest.raises(ValueError, match=r"episode_cost must be numbers, got torch.bool: make the"):
+        evaluate(summed, STILL, 2, seed=0)
+
+
 def test_the_sums_are_enough():
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     episodes = evaluate(counting(sums, ExcludeTransform("cost")), STILL, 20, seed=0)
@@ -157,6 +165,8 @@ def test_an_environment_comes_first(make_env):
     policy = RandomPolicy(env.action_spec)
     with pytest.raises(TypeError, match=r"env must be an instance of EnvBase, got <.*RandomPolicy"):
         evaluate(policy, env, 1, seed=0)
+    with pytest.raises(TypeError, match="policy must be callable, got None"):
+        evaluate(env, None, 1, seed=0)
 
 
 def test_summary_of_hand_made_episodes():

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 import torch
-from counting import CountingBatch
+from counting import CountingBatch, flagged
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
@@ -239,6 +239,11 @@ def test_sums_and_budgets_may_come_before_it(make_env):
 def test_frame_skip_is_a_number(frame_skip):
     with pytest.raises(ValueError, match=f"frame_skip must be a whole number .* got {frame_skip}"):
         FrameSkip(frame_skip)
+
+
+def test_frame_skip_sums_no_flags():
+    with pytest.raises(ValueError, match=r"cost must be a number to be summed, got torch.bool"):
+        flagged(FrameSkip(2)).rollout(1)
 
 
 def test_frame_skip_is_for_environments():

@@ -73,6 +73,8 @@ def test_a_cost_that_overflows_leaves_the_optimizer_as_it_was(adam):
 def test_a_cost_that_is_no_tensor_is_refused(adam):
     with pytest.raises(TypeError, match=r"episode_cost must be a tensor, got \[\[1.0, 2.0\]\]"):
         adam.step([[1.0, 2.0]])
+    with pytest.raises(TypeError, match=r"episode_cost must be numbers, got torch.bool"):
+        adam.step(torch.ones(3, 2, dtype=torch.bool))
 
 
 @pytest.mark.parametrize(

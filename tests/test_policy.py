@@ -464,6 +464,8 @@ def test_the_actor_of_a_file_is_not_saved_again(policy, trained, tmp_path):
         save_policy(tmp_path / "again.pt", policy.actor, Unbounded(40))
     with pytest.raises(TypeError, match=r"observation_spec must be a TensorSpec, .* got Policy"):
         save_policy(tmp_path / "again.pt", testing.make_actor(), policy)
+    with pytest.raises(TypeError, match=r"path must be an instance of str or Path, got \w+\("):
+        save_policy(testing.make_actor(), tmp_path / "again.pt", SPEC)
     assert not (tmp_path / "again.pt").exists()
 
 

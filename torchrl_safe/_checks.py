@@ -84,6 +84,8 @@ def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.fl
 def as_tensor(name: str, values: Any, dtype: torch.dtype) -> Tensor:
     """Returns one or more numbers as a tensor; raises ValueError if they are none."""
     try:
+        if isinstance(values, bool):
+            raise TypeError("a flag is no number")
         return torch.as_tensor(values, dtype=dtype).detach()
     except (OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"{name} must be numbers, got {values!r}.") from error
@@ -123,8 +125,13 @@ def keep_numbers(part: Any, name: str, count: int) -> NDArray[np.float64]:
     return array
 
 
+def is_number(value: Any) -> bool:
+    """Whether it is a real number, and not a flag."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
 def _is_finite(value: Any) -> bool:
     try:
-        return isinstance(value, Real) and math.isfinite(value)
+        return is_number(value) and math.isfinite(value)
     except OverflowError:  # Python's integers can be larger than any float.
         return False

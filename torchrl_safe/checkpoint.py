@@ -18,6 +18,7 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
+from torchrl_safe._checks import check_kind, is_number
 from torchrl_safe._files import UNFINISHED, publish
 
 
@@ -46,6 +47,9 @@ class RunCheckpoints:
         keep_last (int, optional): how many of the last checkpoints to keep. Defaults to ``2``:
             one to fall back on.
 
+    Raises:
+        TypeError: if ``components`` is not a mapping.
+
     Examples:
         >>> import tempfile
         >>> import torch
@@ -68,6 +72,7 @@ class RunCheckpoints:
         settings: Mapping[str, Any] | None = None,
         keep_last: int = 2,
     ) -> None:
+        check_kind("components", components, Mapping, such_as='{"loss": loss}')
         self.folder = Path(folder)
         # As they come back from a file: a tuple as a list.
         self.settings: dict[str, Any] = json.loads(json.dumps(settings or {}))
@@ -93,8 +98,9 @@ class RunCheckpoints:
             The file.
 
         Raises:
-            ValueError: if ``step`` is not a whole number of at most twelve digits, or the folder
-                has a checkpoint of a later step, or one of this step that another run has left.
+            ValueError: if ``step`` is not a whole number of at most twelve digits, ``score`` is no
+                number, or the folder has a checkpoint of a later step, or one of this step that
+                another run has left.
             OSError: if it could not be written, for example because the disk is full; those
                 before are intact. What a ``state_dict`` raises is raised as it is.
         """
@@ -103,6 +109,8 @@ class RunCheckpoints:
             raise ValueError(
                 f"step must be a whole number of at least 0, got {step!r}, and at most 12 digits."
             )
+        if score is not None and not is_number(score):
+            raise ValueError(f"score must be a number, got {score!r}.")
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
         later = [file for file in self._files() if file.name > path.name]
         # A run may write its own last checkpoint again, and no other run's.
@@ -185,6 +193,8 @@ class RunCheckpoints:
     def _load(self, path: Path, map_location: Any) -> int:
         manifest = Checkpoint.manifest(path)
         refuse_other_settings(manifest["metadata"].get("settings", {}), self.settings)
+        if more := manifest["components"].keys() - self._checkpoint.components.keys():
+            raise CheckpointError(f"components must have {sorted(more)} too, which it saved")
         for name, component in manifest["components"].items():
             if component["files"] != [StateDictCheckpointAdapter.state_torch]:
                 raise CheckpointError(

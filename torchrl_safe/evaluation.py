@@ -53,10 +53,11 @@ def evaluate(
         A TensorDict of shape ``(E,)`` with, for each episode, ``episode_reward`` of shape
         ``(E, 1)``, ``episode_cost`` ``(E, k)``, ``steps`` ``(E, 1)``, and ``success`` ``(E, 1)`` if
         the environment has it. The sums are the environment's own if it has ``episode_reward``
-        or ``episode_cost`` (:class:`~torchrl.envs.RewardSum`).
+        or ``episode_cost`` (:class:`~torchrl.envs.RewardSum`). If its own keys are nested, append
+        ``RewardSum([("agent", "reward"), ("agent", "cost")], ["episode_reward", "episode_cost"])``.
 
     Raises:
-        TypeError: if ``env`` is no environment.
+        TypeError: if ``env`` is no environment, or ``policy`` cannot be called.
         ValueError: if the environment has no cost or no reward, or an episode has not ended after
             ``max_steps``.
 
@@ -72,16 +73,26 @@ def evaluate(
         ['success', 'return', 'steps', 'cost/collision', 'any/collision']
     """
     check_kind("env", env, EnvBase)
+    if not callable(policy):
+        raise TypeError(f"policy must be callable, got {policy!r}.")
     check_count(episodes=episodes, max_steps=max_steps)
     specs = {**env.full_observation_spec, **env.full_reward_spec}
     for name in ("reward", "cost"):
         spec = specs.get(f"episode_{name}", specs.get(name))
         if spec is None:
-            raise ValueError(f"env must have the key {name!r} or 'episode_{name}', got {[*specs]}.")
+            raise ValueError(
+                f"env must have the key {name!r} or 'episode_{name}', got {[*specs]}: with nested "
+                "keys, RewardSum can write the second."
+            )
         if len(spec.shape) != env.ndim + 1:
             raise ValueError(
                 f"{name} must have shape (*{tuple(env.shape)}, k), got {tuple(spec.shape)}: "
                 "CostToReward makes a cost of an observation."
+            )
+        if f"episode_{name}" in specs and spec.dtype == torch.bool:
+            raise ValueError(
+                f"episode_{name} must be numbers, got {spec.dtype}: make the environment's {name} "
+                "a float, a sum of flags is a flag."
             )
     rounds = []
     with set_exploration_type(ExplorationType.DETERMINISTIC), _in_evaluation_mode(policy):
@@ -181,5 +192,8 @@ def _figures(after: TensorDictBase, before: TensorDictBase | None) -> TensorDict
     for name in ("reward", "cost"):
         total = f"episode_{name}"
         if total not in figures:
-            figures[total] = after[name] if before is None else before[total] + after[name]
+            step = after[name]
+            if not step.is_floating_point():  # A sum of flags is a flag.
+                step = step.to(torch.get_default_dtype())
+            figures[total] = step if before is None else before[total] + step
     return figures

@@ -23,6 +23,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_safe._checks import check_kind
 from torchrl_safe._files import writing
 from torchrl_safe._program import Program, record
 
@@ -168,7 +169,7 @@ def save_policy(
             numbers, strings, and lists and dicts of them. Defaults to nothing.
 
     Raises:
-        TypeError: if ``actor`` or ``observation_spec`` is not of its kind.
+        TypeError: if ``path``, ``actor`` or ``observation_spec`` is not of its kind.
         ValueError: if the actor cannot be saved. It comes from :func:`load_policy`: copy the file
             instead. It reads several keys (a recurrent actor reads its state) or writes no action.
             It cannot be copied, called or recorded: Python code in it must not decide by the
@@ -188,6 +189,7 @@ def save_policy(
         >>> policy(np.zeros(4)).shape, policy(np.zeros((3, 4))).shape
         ((2,), (3, 2))
     """
+    check_kind("path", path, str | Path)
     path = Path(path)
     observation_key = _observation_key(actor)
     if isinstance(getattr(actor, "module", None), _AnyBatch):
@@ -320,7 +322,7 @@ def shipped_policies() -> dict[str, dict[str, Any]]:
 
     A card has the ``task``, its ``cost_limits``, what episodes of the deterministic policy have
     shown (``success``, ``return``, and each cost; estimates with the ends of their 95 % confidence
-    intervals), and how it was ``trained``.
+    intervals, but for ``worst/``, the mean of the worst tenth), and how it was ``trained``.
 
     Examples:
         >>> card = shipped_policies()["panda-reach-in-front"]

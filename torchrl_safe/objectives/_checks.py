@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from numbers import Real
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_safe._checks import as_tensor, check_one_each
+from torchrl_safe._checks import as_tensor, check_one_each, is_number
 
 # Losses compute in single precision, also with squares of what is positive, and divide by them.
 _LARGEST = torch.finfo(torch.float32).max
@@ -85,7 +84,7 @@ def as_number(value: Any) -> float:
     if isinstance(value, Tensor):
         return float(value.detach()) if value.numel() == 1 and not value.is_complex() else math.nan
     try:
-        return float(value) if isinstance(value, Real) else math.nan
+        return float(value) if is_number(value) else math.nan
     except OverflowError:
         return math.nan
 

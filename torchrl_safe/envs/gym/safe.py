@@ -22,7 +22,7 @@ from torchrl.envs import EnvBase, GymEnv, GymWrapper
 from torchrl.envs.gym_like import BaseInfoDictReader
 from torchrl.envs.libs.gym import terminal_obs_reader
 
-from torchrl_safe._checks import check_array
+from torchrl_safe._checks import check_array, check_count
 from torchrl_safe.envs.gym import autoreset, safety_gymnasium
 
 
@@ -305,6 +305,7 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
 
     Raises:
         TypeError: if ``env_name`` is not a string.
+        ValueError: if ``num_envs`` is not a whole number of at least 0.
 
     Examples:
         >>> env = SafeGymEnv("torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0")
@@ -320,6 +321,7 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
                 f"env_name must be a registered name, got {env_name!r}: SafeGymWrapper takes an "
                 "environment."
             )
+        check_count(least=0, num_envs=kwargs.get("num_envs", 0))
         self._asynchronous = asynchronous
         super().__init__(env_name, **{"backend": "gymnasium", **kwargs})
 

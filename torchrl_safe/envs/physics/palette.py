@@ -27,10 +27,13 @@ GOAL_RADIUS = 0.025
 #: Radius of the ring around it, m: the distance within which the tasks count a success.
 RING_RADIUS = 0.05
 _TUBE = 0.008
+# Around the ring, and around its tube.
+_EDGES = 32, 8
 
 
-def ring(around: int = 32, across: int = 8) -> tuple[Array, NDArray[np.int32]]:
+def ring() -> tuple[Array, NDArray[np.int32]]:
     """Returns a ring that lies flat: vertices, m, ``(v, 3)``, and triangles, ``(t, 3)``."""
+    around, across = _EDGES
     turn, tilt = np.meshgrid(
         np.linspace(0, 2 * np.pi, around, endpoint=False),
         np.linspace(0, 2 * np.pi, across, endpoint=False),

@@ -75,7 +75,8 @@ class CostTally(Transform, abc.ABC):
         spec = rewards[self.cost_key]
         check_one_each("budget", self.budget, spec.shape[-1])
         check_column("reward_key", self.reward_key, rewards[self.reward_key], spec)
-        return Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
+        dtype = spec.dtype if spec.dtype.is_floating_point else torch.get_default_dtype()
+        return Unbounded(spec.shape, dtype=dtype, device=spec.device)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         output_spec = output_spec.clone()
@@ -140,7 +141,7 @@ class CostTally(Transform, abc.ABC):
                 f"{self.out_key!r} must come from the step before, and is missing: a transform "
                 "that uses it must keep it (CatTensors with del_keys=False)."
             )
-        tally = self.advance(before, next_tensordict.get(self.cost_key))
+        tally = self.advance(before, next_tensordict.get(self.cost_key).to(before))
         next_tensordict.set(self.out_key, tally)
         return self.enforce(next_tensordict, self.is_spent(tally).any(-1, keepdim=True))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import TensorSpec
 from torchrl.envs import FrameSkipTransform
 
 from torchrl_safe._checks import check_count
@@ -25,7 +26,8 @@ class FrameSkip(FrameSkipTransform):
         frame_skip (int, optional): how often an action is taken. Defaults to ``1``.
 
     Raises:
-        ValueError: if ``frame_skip`` is not a whole number of at least 1.
+        ValueError: if ``frame_skip`` is not a whole number of at least 1, or, when appended, if a
+            reward of the environment is a flag.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -42,6 +44,12 @@ class FrameSkip(FrameSkipTransform):
     def __init__(self, frame_skip: int = 1) -> None:
         check_count(frame_skip=frame_skip)
         super().__init__(frame_skip)
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        for key, spec in reward_spec.items(True, True):
+            if spec.dtype is torch.bool:
+                raise ValueError(f"{key} must be a number to be summed, got {spec.dtype}.")
+        return reward_spec
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         # Earlier transforms change the action after this one, and do so in each frame anew.

@@ -96,7 +96,7 @@ class Saute(CostTally):
         self.discount: float = discount
 
     def advance(self, tally: Tensor, cost: Tensor) -> Tensor:
-        return (tally - cost / self.budget.to(cost)) / self.discount
+        return (tally - cost / self.budget.to(tally)) / self.discount
 
     def is_spent(self, tally: Tensor) -> Tensor:
         return tally < -ROUNDING

@@ -118,8 +118,7 @@ class CostCritic(CostValues):
         ``("collector", "mask")``, also end it.
 
         Call it on the batch as it was collected. A call of the loss with data without advantages
-        does the same first, if they have a dimension of time; it cannot tell whether you have
-        shuffled them.
+        does the same first. Neither can tell whether you have shuffled a dimension of time.
 
         Args:
             tensordict (TensorDictBase): a batch as collectors return it, shape ``(*B, T)``.
@@ -130,8 +129,8 @@ class CostCritic(CostValues):
 
         Raises:
             KeyError: if the batch has no cost.
-            ValueError: if the cost critic does not write ``cost_value``, or ``num_costs`` is not
-                the width of the cost.
+            ValueError: if the cost critic does not write ``cost_value``, ``num_costs`` is not
+                the width of the cost, or the batch has one dimension that is not named ``"time"``.
         """
         with set_recurrent_mode(True):  # As TorchRL has it around a loss.
             self._estimate_advantages(tensordict)
@@ -141,6 +140,13 @@ class CostCritic(CostValues):
     @torch.no_grad()
     def _estimate_advantages(self, tensordict: TensorDictBase) -> None:
         keys = self.tensor_keys
+        if tensordict.ndim < 2 and "time" not in tensordict.names:
+            raise ValueError(
+                "The data must have a dimension of time for advantages to be estimated, got "
+                f"shape {tuple(tensordict.shape)} without one named 'time'. Call "
+                "estimate_advantages on the whole batch before you take minibatches of it. If "
+                "these steps are in order, set data.names = ['time']."
+            )
         if self.critic_network is None:
             raise ValueError("critic_network must be given to estimate advantages, got None.")
         cost_key = unravel_key(("next", keys.cost))

@@ -125,13 +125,6 @@ class ConstrainedLoss(CostCritic):
 
     def _advantages(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         if not self._has_advantages(tensordict):
-            if tensordict.ndim < 2 and "time" not in tensordict.names:
-                raise ValueError(
-                    "The data must have a dimension of time for advantages to be estimated, got "
-                    f"shape {tuple(tensordict.shape)} without one named 'time'. Call "
-                    "estimate_advantages on the whole batch before you take minibatches of it. If "
-                    "these steps are in order, set data.names = ['time']."
-                )
             self._estimate_advantages(tensordict)
         cost_advantage = tensordict.get(self.tensor_keys.cost_advantage)
         self._check_width(self.tensor_keys.cost_advantage, cost_advantage)

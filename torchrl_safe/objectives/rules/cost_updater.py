@@ -90,7 +90,7 @@ class CostUpdater(abc.ABC):
                 shape ``(E, k)``. With ``E = 0`` nothing changes.
 
         Raises:
-            TypeError: if it is no tensor, or multipliers are in half precision.
+            TypeError: if it is no tensor of numbers, or multipliers are in half precision.
             ValueError: if the shape is wrong or a cost is NaN or infinite. Nothing has changed
                 then.
 
@@ -101,6 +101,11 @@ class CostUpdater(abc.ABC):
         buffer = getattr(self.loss_module, self.buffer_name)
         if not isinstance(episode_cost, Tensor):
             raise TypeError(f"episode_cost must be a tensor, got {episode_cost!r}.")
+        if episode_cost.dtype == torch.bool:
+            raise TypeError(
+                f"episode_cost must be numbers, got {episode_cost.dtype}: make the environment's "
+                "cost a float, a sum of flags is a flag."
+            )
         if episode_cost.ndim != 2 or episode_cost.shape[-1:] != buffer.shape:
             names = f" ({', '.join(self.cost_names)})" if self._has_names else ""
             raise ValueError(
