@@ -26,7 +26,6 @@ def make_state(**changes):
         "contact_force": np.zeros((2, 1)),
         "step": np.zeros(2, int),
         "time": np.zeros(2),
-        "trace": Trace(),
     }
     arrays = {k: v if k in ("trace", "previous") else np.asarray(v) for k, v in changes.items()}
     return ArmState(**{**fields, **arrays})

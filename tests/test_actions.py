@@ -12,6 +12,8 @@ from worlds import ARMS, each_arm, step, turn
 
 from torchrl_safe.envs import (
     PANDA,
+    PAPER_CARTESIAN,
+    PAPER_JOINT,
     ArmEnv,
     ArmModel,
     Bullet,
@@ -26,7 +28,7 @@ from torchrl_safe.envs import (
     Sensing,
 )
 from torchrl_safe.envs.physics.mujoco.model import build_world
-from torchrl_safe.envs.rotations import rotation_vector
+from torchrl_safe.envs.rotations import from_rotation_vector, multiply, rotation_vector
 
 pytestmark = pytest.mark.usefixtures("engine")
 
@@ -204,10 +206,11 @@ def test_tool_keeps_the_orientation_it_is_given(make_env):
 
 @pytest.mark.parametrize(("respect", "expected"), [(True, 2.0), (False, 2.5)])
 def test_joint_targets_respect_limits_if_wanted(respect, expected):
-    state = make_state(joint_position=np.full((2, 7), 1.5))
+    both_ways = np.outer([1.0, -1.0], np.ones(7))
+    state = make_state(joint_position=1.5 * both_ways)
     action = JointDelta(step=1.0, respect_limits=respect)
-    joints, fingers = action.targets(np.ones((2, 7)), state, ())
-    np.testing.assert_array_equal(joints, np.full((2, 7), expected))
+    joints, fingers = action.targets(both_ways, state, ())
+    np.testing.assert_array_equal(joints, expected * both_ways)
     assert fingers.shape == (2, 0)
 
 
@@ -293,6 +296,7 @@ def test_rotation_vector_takes_the_short_way():
     [
         (lambda: CartesianDelta(step=0), "step must be positive and finite, got 0"),
         (lambda: CartesianDelta(bound=-1), "bound must be positive, got -1"),
+        (lambda: JointDelta(bound=0), "bound must be positive, got 0"),
         (lambda: JointDelta(bound=10**400), "bound must be positive, got 1000"),
         (lambda: JointDelta(bound=3e38), "bound must be at most 1.701e\\+38 or infinite, got 3e"),
         (lambda: CartesianDelta(orientation=(0, 0, 0, 0)), "orientation must be a unit quaternion"),
@@ -312,6 +316,7 @@ def test_rotation_vector_takes_the_short_way():
             r"give one of them, got \(1, 0, 0, 0\) and 1",
         ),
         (lambda: CartesianDelta(yaw_step=-1), "yaw_step must be positive and finite, got -1"),
+        (lambda: CartesianDelta(rotation_step=0), "rotation_step must be positive and finite, got"),
         (lambda: CartesianDelta(yaw_step=1, rotation_step=1), "give one of them, got 1 and 1"),
         (lambda: JointDelta(finger_step=0), "finger_step must be positive and finite, got 0"),
         (
@@ -426,15 +431,71 @@ def test_widths(mode, width):
     assert mode.moves_fingers == (mode.finger_step is not None)
 
 
+def test_steps_are_the_papers_unless_others_are_given():
+    assert CartesianDelta().step == PAPER_CARTESIAN.step
+    assert JointDelta().step == PAPER_JOINT.step
+
+
+def test_the_largest_bound():
+    """Twice that is the largest number of float32, and an interval of random actions is as long."""
+    largest = float(np.finfo(np.float32).max) / 2
+    assert CartesianDelta(bound=largest).bound == largest
+
+
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def asked_of_the_tool(action, orientations, **settings):
+    """How the tools of two worlds are to be turned, ``(2, 4)``, and their fingers, ``(2, f)``."""
+    mode = CartesianDelta(inverse_kinematics=lambda _, turned, *__: turned, **settings)
+    state = make_state(ee_orientation=orientations, finger_position=np.zeros((2, 2)))
+    return mode.targets(np.array(action, float), state, SimpleNamespace(home_orientation=DOWN))
+
+
+def test_each_world_turns_as_its_own_action_says():
+    """By 0.1 rad and back by 0.2: from half a turn about x, cos and sin of half the angle."""
+    action = [[0, 0, 0, 0.5], [0, 0, 0, -1]]
+    turned, fingers = asked_of_the_tool(action, [DOWN, DOWN], yaw_step=0.2)
+    np.testing.assert_allclose(
+        turned, [[math.cos(0.05), math.sin(0.05), 0, 0], [math.cos(0.1), -math.sin(0.1), 0, 0]]
+    )
+    assert fingers.shape == (2, 0)
+
+
+def test_turns_and_fingers_have_components_of_their_own():
+    """Of seven the fourth to sixth turn the tool, and the last opens the fingers."""
+    action = [[0, 0, 0, 1, 0, 0, 0.5], [0, 0, 0, 0, 0, -1, 1]]
+    upright = [[0.0, 0.0, 0.0, 1.0]] * 2
+    turned, fingers = asked_of_the_tool(action, upright, rotation_step=0.2, finger_step=0.04)
+    sin, cos = math.sin(0.1), math.cos(0.1)
+    np.testing.assert_allclose(turned, [[sin, 0, 0, cos], [0, 0, -sin, cos]])
+    np.testing.assert_allclose(fingers, [[0.02, 0.02], [0.04, 0.04]])
+
+
+def test_yaw_undoes_a_tilt_and_keeps_the_turn():
+    """One tool turned by 0.4 rad and tilted by 0.8 before; one as it is to be."""
+    tilted = multiply(from_rotation_vector(np.array([0.8, 0.0, 0.0])), DOWN)
+    tilted = multiply(from_rotation_vector(np.array([0.0, 0.0, 0.4])), tilted)
+    turned, _ = asked_of_the_tool(np.zeros((2, 4)), [tilted, DOWN], yaw_step=0.1)
+    expected = [[math.cos(0.2), math.sin(0.2), 0, 0], DOWN]
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+def test_yaw_turns_the_orientation_that_is_given():
+    """Here half a turn and 0.3 rad more about x, which is not what the home pose has."""
+    given = (math.cos(0.15), 0.0, 0.0, -math.sin(0.15))
+    action = [[0, 0, 0, 0], [0, 0, 0, 1]]
+    turned, _ = asked_of_the_tool(action, [given, given], yaw_step=0.2, orientation=given)
+    sin, cos = math.sin(0.1), math.cos(0.1)
+    expected = [given, [cos * given[0], sin * given[0], sin * given[3], cos * given[3]]]
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
 def test_yaw_of_a_tool_that_points_up():
     """Its turn about the vertical is not defined then, but the next action brings it back."""
-    action = CartesianDelta(
-        yaw_step=0.1, inverse_kinematics=lambda _, orientation, *__: orientation
-    )
-    down = np.array([1.0, 0.0, 0.0, 0.0])
-    state = make_state(ee_orientation=[[0.0, 0.0, 0.0, 1.0]] * 2)
-    wanted, _ = action.targets(np.zeros((2, 4)), state, SimpleNamespace(home_orientation=down))
-    np.testing.assert_allclose(wanted, [down, down], atol=0)
+    up = [[0.0, 0.0, 0.0, 1.0]] * 2
+    wanted, _ = asked_of_the_tool(np.zeros((2, 4)), up, yaw_step=0.1)
+    np.testing.assert_allclose(wanted, [DOWN, DOWN], atol=0)
 
 
 def test_orientation_may_be_an_array(make_env):

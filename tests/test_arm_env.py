@@ -491,6 +491,11 @@ class Mode(JointDelta):
         ({"costs": {"flat": lambda state: 0.0}}, r"cost 'flat' must have shape \(1,\), got \(\)"),
         ({"costs": {"nan": always("nan")}}, "cost 'nan' must be finite"),
         ({"task": Task(drawn=np.ones(3))}, "sample of the task must return two arrays"),
+        ({"task": Task(drawn=(np.ones(3),))}, "sample of the task must return two arrays"),
+        (
+            {"task": Task(drawn=(np.ones(3), np.zeros((1, 3))))},
+            r"objects must have shape \(0, 3\), got \(1, 3\)",
+        ),
         ({"task": Task(goal=[0.6])}, r"goal must have shape \(3,\), got \(1,\)"),
         ({"task": Task(goal=[0.6, 0, np.nan])}, "goal must be finite"),
         ({"task": Task(reward=0.0)}, r"reward must have shape \(1,\), got \(\)"),

@@ -439,7 +439,7 @@ def test_every_algorithm_goes_on(algorithm, settings, tmp_path):
         (envs.PickAndPlace, "sparse"),
         (envs.Scene, "motor_limits"),
         (envs.Bullet, "merged_links"),
-        (envs.Sensing, "tool"),
+        *((envs.Sensing, name) for name in ("table", "itself", "joints", "tool", "links")),
     ],
 )
 def test_a_flag_that_is_neither_true_nor_false_is_named(kind, name, value):

@@ -8,6 +8,7 @@ from worlds import ENGINES, each_arm
 
 from torchrl_safe.envs import PANDA, UR5, XARM6, ArmEnv, Bullet, NoObstacles, Scene, find_home
 from torchrl_safe.envs.kinematics import approach, distance_to_reach
+from torchrl_safe.envs.rotations import from_rotation_vector, multiply
 
 DOWN = (1.0, 0.0, 0.0, 0.0)
 
@@ -66,6 +67,30 @@ def test_searches_side_by_side_are_those_of_each_alone(physics):
     assert misses[3] > 1.0
 
 
+@pytest.mark.parametrize("arm", [PANDA, UR5], ids=["panda", "ur5"])
+def test_what_joint_angles_near_home_reach_is_found_to_be_in_reach(arm):
+    """Wherever the tool is when each joint has turned by up to a radian."""
+    simulator = Bullet().build(arm, Scene(), num_envs=1)
+    turns = np.random.default_rng(0).uniform(-1, 1, (200, len(arm.home)))
+    angles = np.clip(arm.home + turns, simulator.joint_lower, simulator.joint_upper)
+    missed = distance_to_reach(simulator, arm.home, simulator.tool_at(angles)[0])
+    simulator.close()
+    assert not missed.any()
+
+
+def test_a_tool_that_is_there_already_is_still_turned():
+    """By a radian, on the spot: the search is not over where the distance is 0."""
+    simulator = Bullet().build(PANDA, Scene(), num_envs=1)
+    position, orientation = simulator.tool_at(np.array([PANDA.home]))
+    wanted = multiply(from_rotation_vector(np.array([[0.0, 0.0, 1.0]])), orientation)
+    found = approach(simulator, np.array([PANDA.home]), position, wanted)
+    there, turned = simulator.tool_at(found.angles)
+    simulator.close()
+    np.testing.assert_allclose(there, position, atol=1e-5)
+    assert abs(turned[0] @ wanted[0]) == pytest.approx(1, abs=1e-6)
+    assert max(found.distance[0], found.turn[0]) < 1e-5
+
+
 @each_arm
 def test_out_of_reach(arm):
     with pytest.raises(
@@ -86,6 +111,7 @@ def test_a_joint_limit(turntable):
     position = (0.5 * np.cos(angle), 0.5 * np.sin(angle), 0.5)
     orientation = (0, 0, np.sin(angle / 2), np.cos(angle / 2))
     message = (
+        r"stays 0\.247 m and 0\.500 rad away: "
         r"a joint limit stopped it: joint 1, counted from the base, would have to be at "
         r"1\.500 rad and goes from -1\.000 to 1\.000"
     )

@@ -310,11 +310,15 @@ def test_bad_arguments(make, kind, message):
 
 @both_engines
 def test_what_moves_must_be_fixed(make_env):
-    """A path for a shape with a mass would fight physics."""
-    path = Placement([[0.6, 0, 0.1]]).at
-    layout = Places(Box(mass=1.0), at=[(0.6, 0, 0.1)], path=path)
-    with pytest.raises(ValueError, match=r"path moves fixed shapes only .mass 0., got .*mass=1.0"):
-        ArmEnv(obstacles=layout)
+    """A path for a shape with a mass would fight physics, even for one of several."""
+    places = [(0.6, 0, 0.1), (0.6, 0.3, 0.1)]
+    for shapes in ([Box(mass=1.0)], [Box(), Box(mass=1.0)]):
+        at = places[: len(shapes)]
+        layout = Places(*shapes, at=at, path=Placement(at).at)
+        with pytest.raises(
+            ValueError, match=r"path moves fixed shapes only .mass 0., got .*mass=1.0"
+        ):
+            ArmEnv(obstacles=layout)
 
 
 @both_engines

@@ -13,6 +13,7 @@ import pytest
 import torch
 from bullet_worlds import worlds_of
 from scripted import fly, go, straight
+from states import make_state
 from torchrl.envs.utils import check_env_specs
 from worlds import step
 
@@ -102,6 +103,47 @@ def test_actions_are_not_clipped(make_env):
     assert env.arm_state.joint_position[0, 0] - start > 0.2
 
 
+def test_cartesian_actions_are_not_clipped_either(make_env):
+    """Three times as much is done of one that is three times as large."""
+    env = make_env(paper_env, num_envs=2, seed=0)
+    env.reset()
+    start = env.arm_state.ee_position[:, 2]
+    for _ in range(8):
+        step(env, torch.tensor([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 3.0, 0.0]]))
+    one, three = env.arm_state.ee_position[:, 2] - start
+    assert three / one == pytest.approx(3, rel=0.1)
+
+
+def test_joint_commands_go_beyond_the_limits():
+    """Which are at 2 rad here: a tenth of the action is added, whatever comes of it."""
+    state = make_state(joint_position=[[1.95] * 7, [-1.95] * 7])
+    targets, _ = PAPER_JOINT.targets(np.array([[1.0] * 7, [-1.0] * 7]), state, None)
+    np.testing.assert_allclose(targets, [[2.05] * 7, [-2.05] * 7])
+
+
+def test_the_tool_points_down_and_a_quarter_turn_aside():
+    turned = pybullet.getQuaternionFromEuler((0, -math.pi, math.pi / 2))
+    assert abs(np.dot(PAPER_CARTESIAN.orientation, turned)) == pytest.approx(1)
+
+
+def test_the_arm_is_the_one_of_the_file(make_env):
+    """All of its twelve joints, and the 0.1 kg m^2 that the file writes for every link."""
+    world = worlds_of(make_env(paper_env))[0]
+    arm, client = world._arm.body, world._client
+    assert pybullet.getNumJoints(arm, physicsClientId=client) == 12
+    for link in range(7):
+        inertia = pybullet.getDynamicsInfo(arm, link, physicsClientId=client)[2]
+        assert inertia == pytest.approx((0.1, 0.1, 0.1))
+
+
+def test_success_is_within_9_centimetres_counted_along_the_axes():
+    """Both tools are 5 cm away as the crow flies."""
+    state = make_state(
+        ee_position=[[0.03, 0.03, 0.029], [0.03, 0.03, 0.031]], goal=np.zeros((2, 3))
+    )
+    assert PAPER_SETTINGS["task"].success(state).tolist() == [True, False]
+
+
 def test_tool_pose_lags_one_substep(make_env):
     env = make_env(paper_env, seed=0)
     env.reset()
@@ -114,7 +156,7 @@ def test_tool_pose_lags_one_substep(make_env):
 def test_gap_with_a_contact_point_costs(make_env):
     """Bullet reports contact points before a touch: so the original counts."""
     (cost,) = make_env(paper_env).costs.values()
-    distances = np.array([[np.inf], [0.0015], [-0.001]])
+    distances = np.array([[np.inf, np.inf], [np.inf, 0.0015], [-0.001, np.inf]])
     assert cost(SimpleNamespace(contact_distance=distances)).tolist() == [0, 1, 1]
 
 

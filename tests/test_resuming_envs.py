@@ -284,6 +284,17 @@ def test_a_loaded_collector_goes_on_bit_for_bit():
     assert not torch.equal(expected[0]["observation"], got[0]["observation"])
 
 
+def test_a_collector_of_several_arms_goes_on_bit_for_bit():
+    """Their states are parts of that of their SerialEnv."""
+
+    def make():
+        env = SerialEnv(2, partial(ArmEnv, max_episode_steps=9))
+        return ResumableCollector(env, make_noisy(env), **SETTINGS)
+
+    for one, two in zip(*collect(make, 3), strict=True):
+        assert_equal(one, two)
+
+
 def test_a_loaded_collector_ends_where_the_saved_one_would():
     def make():
         env = make_training_env(4)

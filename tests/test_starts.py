@@ -19,7 +19,7 @@ from torchrl_safe.envs import (
     Reach,
     Region,
 )
-from torchrl_safe.envs.generators import pack
+from torchrl_safe.envs.generators import pack, unpack
 from torchrl_safe.envs.gym import ARMS, OBSTACLES, TASKS, combination
 
 # Now and then a goal is drawn that leaves no room between it and the arm at home.
@@ -82,6 +82,20 @@ def test_a_checkpoint_from_before_a_rare_draw_goes_on(make_env):
     np.testing.assert_array_equal(resumed.arm_state.goal, env.arm_state.goal)
 
 
+def test_a_packed_generator_goes_on_where_it_was():
+    """Also where half of a 64-bit word is left for the next number; and each on its own."""
+    whole, half = (np.random.default_rng(seed) for seed in (1, 2))
+    half.integers(10, dtype=np.uint32)
+    assert half.bit_generator.state["has_uint32"]
+    packed = [pack(generator) for generator in (whole, half)]
+    assert {(numbers.dtype, numbers.shape) for numbers in packed} == {(np.dtype("u1"), (40,))}
+    copies = [unpack(numbers) for numbers in packed]
+    for generator, copied in zip((whole, half), copies, strict=True):
+        drawn = generator.integers(10**6, size=3, dtype=np.uint32)
+        np.testing.assert_array_equal(copied.integers(10**6, size=3, dtype=np.uint32), drawn)
+        assert copied.bit_generator.state == generator.bit_generator.state
+
+
 def test_each_draw_is_a_new_one(make_env):
     layout = Sometimes(every=7)
     env = make_env(ArmEnv, task=Push(), obstacles=layout, seed=0)
@@ -125,7 +139,7 @@ def test_what_hardly_ever_fits_is_refused():
     ):
         ArmEnv(obstacles=Sometimes(every=101))
     at_home = Places(Cylinder(), at=[[0.35, 0, 0.2]])
-    with pytest.raises(ValueError, match=r"overlap of .* None of 100 draws"):
+    with pytest.raises(ValueError, match=r"overlap of 0\.\d+ m .* None of 100 draws"):
         ArmEnv(obstacles=at_home)
 
 

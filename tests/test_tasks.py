@@ -340,6 +340,30 @@ def test_unreachable_goals(task, what):
         ArmEnv(task=task, obstacles=NoObstacles())
 
 
+def test_a_goal_a_hair_out_of_reach(turntable):
+    """The end of the bar goes round at 0.5 m; up to 2 cm further is as good as there."""
+    turntable["task"] = Reach(Region((0.51, 0, 0.5), (0.51, 0, 0.5)))
+    ArmEnv(**turntable).close()
+    turntable["task"] = Reach(Region((0.55, 0, 0.5), (0.55, 0, 0.5)))
+    with pytest.raises(ValueError, match=r"got \[0\.55, 0\.0, 0\.5\] .* stays 0\.050 m away"):
+        ArmEnv(**turntable)
+
+
+def test_a_single_object_out_of_reach():
+    """That of the third draw: the places of all draws are looked at."""
+    drawn = []
+
+    class Strewn(Push):
+        def sample(self, rng, goals):
+            goal, objects = super().sample(rng, goals)
+            drawn.append(objects)
+            return goal, objects + (len(drawn) == 3) * np.array([2.0, 0.0, 0.0])
+
+    message = r"task must draw objects that the arm can reach, got \[2\.\d+, .* stays 1\.\d+ m away"
+    with pytest.raises(ValueError, match=message):
+        ArmEnv(task=Strewn(), obstacles=NoObstacles())
+
+
 @both_engines
 @pytest.mark.parametrize("name", ARMS)
 def test_objects_lie_still(make_env, name):
@@ -378,8 +402,21 @@ def test_the_arm_pushes_the_object(make_env, arm):
     assert result["reward"].item() == pytest.approx(reward, abs=1e-6)
 
 
+class PushOneOfTwo(Push):
+    """Another object stands at 10 cm from the one to push."""
+
+    @property
+    def objects(self):
+        return (self.shape, self.shape)
+
+    def sample(self, rng, goals):
+        goal, objects = super().sample(rng, goals)
+        return goal, np.stack([objects[0], objects[0] + (0, 0.1, 0)])
+
+
+@pytest.mark.parametrize("kind", [Push, PushOneOfTwo])
 @both_engines
-def test_the_first_object_is_where_the_way_begins(make_env):
+def test_the_first_object_is_where_the_way_begins(make_env, kind):
     """Obstacles of a pushing task stand between cube and goal."""
 
     class Note(Places):
@@ -388,7 +425,7 @@ def test_the_first_object_is_where_the_way_begins(make_env):
             return super().sample(rng, start, goal)
 
     layout = Note(at=np.zeros((0, 3)))
-    env = make_env(ArmEnv, task=Push(), obstacles=layout, seed=0)
+    env = make_env(ArmEnv, task=kind(), obstacles=layout, seed=0)
     env.reset()
     np.testing.assert_array_equal(layout.seen[0], env.arm_state.object_position[0, 0])
     np.testing.assert_array_equal(layout.seen[1], env.arm_state.goal[0])

@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from on_policy import make_loss
 from torch.distributions.transforms import SoftplusTransform
 
 from torchrl_safe.envs import IIWA, ArmEnv, Scattered
@@ -19,7 +21,7 @@ from torchrl_safe.objectives import (
     PIDControl,
     ViolationUpdater,
 )
-from torchrl_safe.trainers import ConstrainedPPOTrainer
+from torchrl_safe.trainers import ConstrainedPPOTrainer, configs
 from torchrl_safe.trainers.configs import (
     ArmEnvConfig,
     ConstrainedPPOTrainerConfig,
@@ -155,6 +157,27 @@ def test_a_loss_that_reads_violations(example):
     assert isinstance(trainer.loss_module, CRPOLoss)
     trainer._modules["multiplier"].updater.step(torch.tensor([[2.0]]))
     assert trainer.loss_module.cost_violation.tolist() == [1.5]
+    trainer.shutdown()
+
+
+@pytest.mark.parametrize("own", [{"policy": "mine"}, {"policy_factory": "mine"}, {"policy": None}])
+def test_a_collector_keeps_a_policy_of_its_own(monkeypatch, own):
+    """One that is given nothing, or None, gets the policy of the loss; here it is a mere dict."""
+    monkeypatch.setattr(configs, "_make_onpolicy_trainer", lambda make, **parts: parts["collector"])
+    loss = make_loss()
+    collector = configs.make_constrained_ppo_trainer(
+        collector=partial(dict, frames_per_batch=40, **own),
+        loss_module=loss,
+        updater=partial(DualAscent, cost_limit=1.0, lr=0.1),
+    )
+    given = own if "mine" in own.values() else {"policy": loss.actor_network}
+    assert collector == {"frames_per_batch": 40, **given}
+
+
+def test_a_nested_key_arrives_as_one(example):
+    """In YAML it is a list."""
+    trainer = instantiate(read(example, "trainer.episode_cost_key=[arms,cost]").trainer)
+    assert trainer._modules["multiplier"].episode_cost_key == ("next", "arms", "cost")
     trainer.shutdown()
 
 

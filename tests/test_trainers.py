@@ -241,6 +241,18 @@ def test_an_updater_of_another_loss(make_arm):
     other = DualAscent(make_loss(num_costs=2), cost_limit=1.0, lr=0.5)
     with pytest.raises(ValueError, match="updater must be of the trainer's loss_module"):
         arm.trainer(updater=other)
+    trainer = arm.trainer(PPOTrainer, gae=arm.loss.estimate_advantages)
+    trainer.loss_module = len
+    with pytest.raises(ValueError, match="loss_module, a builtin_function_or_method: it moves"):
+        MultiplierHook(arm.updater).register(trainer)
+
+
+def test_two_hooks_have_names_of_their_own(make_arm):
+    """The states of both are saved."""
+    arm = make_arm()
+    trainer = arm.safe_trainer()
+    MultiplierHook(arm.updater).register(trainer, "other")
+    assert {"multiplier", "other"} <= set(trainer.state_dict())
 
 
 # ---------------------------------------------------------------- the trainers
@@ -402,6 +414,39 @@ def test_discounts(make_arm):
         assert estimator.lmbda.item() == pytest.approx(0.8)
     with pytest.raises(ValueError, match=r"gamma and lmbda must be given together, got 0\.9"):
         arm.safe_trainer(gamma=0.9)
+    with pytest.raises(ValueError, match=r"got None and 0\.8"):
+        arm.safe_trainer(lmbda=0.8)
+
+
+def test_advantages_by_a_function_of_ones_own(make_arm):
+    """It takes the place of the loss's: with each batch it is asked once in each epoch."""
+    arm, shapes = make_arm(), []
+
+    def estimate(batch):
+        shapes.append(batch.shape)
+        return arm.loss.estimate_advantages(batch)
+
+    arm.safe_trainer(gae=estimate, num_epochs=3).train()
+    assert shapes == [(WORLDS, FRAMES // WORLDS)] * 6
+
+
+def test_advantages_that_come_with_the_batch(make_arm):
+    """Without ``add_gae`` nobody writes others over them."""
+    arm = make_arm()
+
+    def estimate(batch):
+        return arm.loss.estimate_advantages(batch).set("advantage", torch.full((4, 10, 1), 7.0))
+
+    trainer = arm.safe_trainer(add_gae=False)
+    trainer.register_op("batch_process", estimate)
+    trainer.train()
+    assert (arm.buffer[:]["advantage"] == 7).all()
+
+
+def test_the_loss_reads_ends_where_the_done_key_says(make_arm):
+    arm = make_arm()
+    arm.safe_trainer(done_key="truncated")
+    assert arm.loss.tensor_keys.done == "truncated"
 
 
 PID = {"cost_limit": 2.0, "kp": 0.5, "ki": 0.1, "kd": 0.5}
@@ -506,6 +551,14 @@ def test_a_trainer_that_sees_no_batches(make_arm):
     hook = MultiplierHook(DualAscent(make_loss(), cost_limit=1.0, lr=0.5))
     with pytest.raises(ValueError, match="collector must yield its batches"):
         hook.log(None)
+
+
+def test_a_trainer_that_learns_in_another_process(make_arm):
+    arm = make_arm()
+    trainer = arm.trainer(PPOTrainer, gae=arm.loss.estimate_advantages)
+    trainer.learner_backend = "ray"
+    with pytest.raises(ValueError, match="learner_backend must be 'local', got 'ray'"):
+        MultiplierHook(arm.updater).register(trainer)
 
 
 def test_ends_are_where_the_done_key_says(make_arm):

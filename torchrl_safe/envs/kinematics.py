@@ -94,7 +94,8 @@ class Approach(NamedTuple):
     angles: Array
     #: Distances from the positions, m, ``(k,)``.
     distance: Array
-    #: Angles from the orientations, rad, ``(k,)``; 0 where any will do.
+    #: Length of the rotation vectors to the orientations, ``(k,)``: twice the sine of half the
+    #: angle; 0 where any will do.
     turn: Array
 
 
