@@ -142,7 +142,7 @@ class Config:
     frames_per_batch: int = 1024
     """Control steps between two updates of the policy."""
     epochs: int = 10
-    """Passes over each batch; not off policy, where batches come from replay."""
+    """Passes over each batch; a2c-lagrangian makes one. Has no effect off policy."""
     minibatch: int = 256
     """Control steps in a minibatch."""
     learning_rate: float = 5e-4

@@ -79,7 +79,7 @@ def find_home(
         for end in (found, free):
             if _has_arrived(end) and not _beyond_limits(simulator, end.angles):
                 return tuple(end.angles.tolist())
-        angle = 2 * np.arcsin(min(found.turn / 2, 1))
+        angle = 2 * np.arcsin(np.minimum(found.turn / 2, 1))
         raise ValueError(
             f"position and orientation must be a pose that the arm gets to from its home, got "
             f"{point.tolist()} and {turned.tolist()}, from which the tool stays "

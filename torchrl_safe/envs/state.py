@@ -159,8 +159,8 @@ class ArmState:
         shield_correction: how far the joint targets of the last control step were from those that
             the action asked for, rad, ``(N,)``: the length of the difference. 0 after a reset;
             ``None`` without a :class:`~torchrl_safe.envs.Shield`.
-        shield_braked: in which worlds the shield held the arm still because nothing else was safe,
-            bool, ``(N,)``. ``None`` without a shield.
+        shield_braked: in which worlds the shield braked, bool, ``(N,)``: nothing near what was
+            asked for was safe, or the arm was pressed on something. ``None`` without a shield.
 
     Examples:
         >>> from torchrl_safe.envs import ArmEnv
