@@ -85,10 +85,10 @@ def test_the_transforms_need_no_simulator():
 @pytest.mark.parametrize(
     ("module", "needed"),
     [
-        ("policy", {"_files", "_program"}),
+        ("policy", {"_checks", "_files", "_program"}),
         ("evaluation", {"_checks", "metrics"}),
         ("metrics", {"_checks"}),
-        ("checkpoint", {"_files"}),
+        ("checkpoint", {"_checks", "_files"}),
         ("collectors", set()),
     ],
 )
