@@ -296,6 +296,7 @@ def test_rotation_vector_takes_the_short_way():
     [
         (lambda: CartesianDelta(step=0), "step must be positive and finite, got 0"),
         (lambda: CartesianDelta(bound=-1), "bound must be positive, got -1"),
+        (lambda: JointDelta(bound=True), "bound must be positive, got True"),
         (lambda: JointDelta(bound=0), "bound must be positive, got 0"),
         (lambda: JointDelta(bound=10**400), "bound must be positive, got 1000"),
         (lambda: JointDelta(bound=3e38), "bound must be at most 1.701e\\+38 or infinite, got 3e"),

@@ -537,6 +537,7 @@ def test_wrong_budgets(transform, budget):
         (lambda: SAUTE(torch.tensor([1.0, 0.0])), r"budget must be above 0, got tensor"),
         (lambda: SAUTE(1.0, discount=0.0), r"discount must be above 0 and at most 1, got 0\.0"),
         (lambda: SAUTE(1.0, discount=1.1), r"discount must be above 0 and at most 1, got 1\.1"),
+        (lambda: SAUTE(1.0, discount=True), "discount must be .* got True"),
         (lambda: SAUTE(1.0, discount=float("nan")), "discount must be .* got nan"),
         (lambda: Saute(1.0, unsafe_reward=float("nan")), "unsafe_reward must be finite, got nan"),
         (

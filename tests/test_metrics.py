@@ -303,6 +303,7 @@ def test_bad_costs_are_refused(metric, costs, message):
         (partial(mean, column(1.0, 2.0), resample="seeds"), r"at least 2 seeds .* \(2, 1\)"),
         (partial(violation_rate, column(1.0), torch.zeros(2)), r"cost_limit must be one .* \(2,\)"),
         (partial(violation_rate, column(1.0), NAN), "cost_limit must be finite, got nan"),
+        (partial(conditional_value_at_risk, column(1.0), True), "alpha must be .* got True"),
         (partial(conditional_value_at_risk, column(1.0), 0.0), "alpha must be .* got 0.0"),
         (partial(conditional_value_at_risk, column(1.0), 1.5), "alpha must be .* got 1.5"),
         (partial(worst_seed, column(1.0, 2.0)), r"shape \(S, E, k\), got \(2, 1\)"),

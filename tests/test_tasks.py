@@ -51,6 +51,7 @@ def test_goals_fill_the_box():
     [
         ({"radius": 0}, "radius must be positive and finite, got 0"),
         ({"radius": float("nan")}, "radius must be positive and finite, got nan"),
+        ({"order": True}, "order must be at least 1, got True"),
         ({"order": 0}, "order must be at least 1, got 0"),
     ],
 )
@@ -308,7 +309,7 @@ def test_region_must_be_wide_enough(kind):
         ArmEnv(task=task, action=GRIP)
 
 
-@pytest.mark.parametrize("share", [-0.1, 1.1, np.nan])
+@pytest.mark.parametrize("share", [-0.1, 1.1, np.nan, True])
 def test_on_table_is_a_share(share):
     with pytest.raises(ValueError, match=f"on_table must be between 0 and 1, got {share}"):
         PickAndPlace(on_table=share)

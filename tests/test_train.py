@@ -446,7 +446,10 @@ def test_noise_falls_from_batch_to_batch():
         ({"algorithms": ("ppo-saute",), "cost_limit": 0.0}, "cost_limit must be positive with ppo"),
         ({"shield": True, "paper": True}, "shield must be False with paper"),
         ({"costs": {"speed": -1.0}}, "costs must have limits of at least 0, got -1.0 for speed"),
-        ({"costs": {"speed": 1.0}, "cost_limit": 2.0}, "cost_limit must not be given with costs"),
+        (
+            {"costs": {"speed": 1.0}, "cost_limit": 2.0},
+            "cost_limit must not be given with costs, which sets it, got 2",
+        ),
         ({"costs": {"speed": 1.0}, "paper": True}, "costs must be {} with paper, got {'speed': 1"),
     ],
 )

@@ -109,8 +109,8 @@ class Shield:
     If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
     motion that does not use up more than all the room. If there is none, it stands still, or gives
     way to what comes as far as what stands allows. An arm with less than half of a margin left
-    brakes too: it only withdraws, whatever is asked for, and its tool does not go down if
-    it can withdraw otherwise.
+    brakes too: it only withdraws, whatever is asked for, and its tool does not go down if it can
+    withdraw otherwise.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -332,10 +332,10 @@ class Shield:
         )
 
     def _with_tool(self, step: _Step, near: _Pairs, pressed: NDArray[np.bool_]) -> _Pairs:
-        """Adds what holds for the tool point: the walls of the workspace, from which it keeps away.
+        """Adds what holds for the tool point.
 
-        The tool of a pressed arm does not go down. It may be on an object, which the shield does
-        not see and whose friction would hold the arm.
+        It keeps away from the walls of the workspace. That of a pressed arm does not go down: it
+        may be on an object, which the shield does not see and whose friction would hold the arm.
         """
         walls = self.workspace
         if walls is None and not pressed.any():
