@@ -62,4 +62,4 @@ def forked_workers():
 @pytest.fixture(autouse=True)
 def seed():
     """Numbers that a test draws do not depend on the tests before it."""
-    torch.manual_seed(0)
+    torch.default_generator.manual_seed(0)

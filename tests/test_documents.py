@@ -367,15 +367,17 @@ def test_trainers(tmp_path):
     (config,) = code_of("docs/trainers.md", "yaml")
     code = "\n".join(code_of("docs/trainers.md"))
     for text, name in ((config, "config.yaml"), (code, "trainers.py")):
-        short = re.sub(r"(frames_per_batch|total_frames)(=|: )[0-9_]+", r"\g<1>\g<2>1280", text)
+        short = re.sub(r"(frames_per_batch|total_frames)(=|: )[0-9_]+", r"\g<1>\g<2>320", text)
         short = re.sub(r"num_epochs(=|: )10", r"num_epochs\g<1>1", short)
-        assert short.count("1280") == 2
+        short = re.sub(r"num_envs(=|: )32", r"num_envs\g<1>8", short)
+        short = short.replace("batches, steps = 2, 1_280", "batches, steps = 2, 320")
+        assert short.count("320") == (2 if name == "config.yaml" else 3)
         (tmp_path / name).write_text(short, encoding="utf-8")
     shown = re.findall(r"multiplier (\S+)", run(tmp_path / "trainers.py", tmp_path))
     assert len(shown) == 2
     (log,) = tmp_path.joinpath("runs").rglob("episode_cost/collision.csv")
     step, cost = log.read_text().split(",")
-    assert int(step) == 1280
+    assert int(step) == 320
     # What is shown is the rule at work: a cost above the limit of 0.5 lifts the multiplier.
     assert 0 <= float(shown[0]) < 1.21
     assert float(shown[0]) > 0 or float(cost) <= 0.5

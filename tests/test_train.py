@@ -49,7 +49,7 @@ def finished(tmp_path_factory):
         frames_per_batch=512,
         envs=4,
         workers=1,
-        eval_episodes=32,
+        eval_episodes=8,
         multiplier_init=5.0,
         # Which so few episodes cannot cost on average.
         cost_limit=0.3,

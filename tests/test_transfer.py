@@ -196,7 +196,7 @@ def test_table_and_folder(tmp_path, capsys):
     config = transfer.Config(
         policies=(str(tmp_path / "mine.pt"),),
         conditions=("as trained", "heavy object"),
-        episodes=32,
+        episodes=8,
         jobs=1,
         out=tmp_path / "out",
     )

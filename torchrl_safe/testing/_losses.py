@@ -11,6 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
+from torchrl_safe.testing._random import seeded
+
 MakeLoss = Callable[..., LossModule]
 MakeNetworks = Callable[..., tuple[Any, Any, Any]]
 MakeData = Callable[..., TensorDictBase]
@@ -77,8 +79,7 @@ def build_parent(make_parent: MakeLoss, make_networks: MakeNetworks, num_costs: 
 
 
 def finish(make: Callable[[], LossModule], seed: int) -> LossModule:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)  # Ensembles draw their copies anew.
+    with seeded(seed):  # Ensembles draw their copies anew.
         loss = make()
         if follow_targets(loss) is not None:
             with torch.no_grad():
@@ -95,8 +96,7 @@ def follow_targets(loss: LossModule) -> SoftUpdate | None:
 
 def call(loss: Callable[..., Any], *args: TensorDictBase, seed: int = 7, **kwargs: Tensor) -> Any:
     """The outputs of a loss for a copy of the data, its random numbers drawn from a seed."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with seeded(seed):
         return loss(*(data.clone() for data in args), **kwargs)
 
 

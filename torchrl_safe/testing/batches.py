@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives import CostGAE, scaled_advantages
+from torchrl_safe.testing._random import seeded
 from torchrl_safe.testing.networks import (
     ACTION_SIZE,
     OBSERVATION_SIZE,
@@ -38,8 +39,7 @@ def make_batch(num_costs: int = 1, *, seed: int = 1) -> TensorDictBase:
         >>> batch["next", "cost"].shape
         torch.Size([4, 6, 3])
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with seeded(seed):
         return _make_batch(num_costs)
 
 
@@ -129,8 +129,7 @@ def make_transitions(
     size = num_transitions
     index = torch.arange(size).unsqueeze(-1)
     terminated, truncated = index % 4 == 1, index % 4 == 2
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with seeded(seed):
         return TensorDict(
             observation=torch.randn(size, OBSERVATION_SIZE),
             action=torch.rand(size, ACTION_SIZE) * 2 - 1,

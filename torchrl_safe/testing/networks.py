@@ -17,6 +17,8 @@ from torchrl.modules import (
     ValueOperator,
 )
 
+from torchrl_safe.testing._random import seeded
+
 #: Numbers in an observation and in an action.
 OBSERVATION_SIZE, ACTION_SIZE = 4, 2
 
@@ -98,8 +100,7 @@ def make_networks(
         >>> losses["loss_cost_critic"].isfinite()
         tensor(True)
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with seeded(seed):
         return (
             make_actor(),
             make_critic(keys.get("value", "state_value")),
@@ -195,8 +196,7 @@ def make_q_networks(
     action = keys.get("action", "action")
     value = keys.get("state_action_value", "state_action_value")
     cost_value = keys.get("state_action_cost_value", "state_action_cost_value")
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with seeded(seed):
         return (
             make_q_actor(deterministic=deterministic, action=action),
             make_q_critic(value, action=action),
