@@ -10,7 +10,7 @@ import torch
 
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Draws from a seed, and leaves the global generators of all devices as they were."""
+    """Draws from a seed, and leaves the generators of CPU and GPUs as they were."""
     devices = range(torch.cuda.device_count() if torch.cuda.is_initialized() else 0)
     with torch.random.fork_rng(devices=devices):
         # Not torch.manual_seed: it also seeds devices that nobody uses, and formats the stack
