@@ -85,9 +85,9 @@ def test_quickstart(tmp_path):
     assert env == code_of("README.md")[0]
     assert len(loop.splitlines()) <= 44
     # The same program on fewer frames, with fewer passes over them.
-    short = loop.replace("total_frames=153_600", "total_frames=4_096")
+    short = loop.replace("2048, total_frames=153_600", "1280, total_frames=2560")
     short = short.replace("range(10)", "range(2)")
-    assert short.count("4_096") == short.count("range(2)") == 1
+    assert short.count("2560") == short.count("range(2)") == 1
     script = tmp_path / "quickstart.py"
     script.write_text(short, encoding="utf-8")
     lines = re.findall(

@@ -45,8 +45,8 @@ def tiny_film(*args, **settings):
 def finished(tmp_path_factory):
     """The folder of a finished run, and what it has printed; each film is of one episode."""
     config = Config(
-        frames=1024,
-        frames_per_batch=512,
+        frames=512,
+        frames_per_batch=256,
         envs=4,
         workers=1,
         eval_episodes=8,
@@ -67,7 +67,7 @@ def test_what_it_leaves(finished):
     results = json.loads((out / "results.json").read_text())
     assert list(results["algorithms"]) == ["ppo", "ppo-lagrangian"]
     for name, run in results["algorithms"].items():
-        assert [row["frames"] for row in run["history"]] == [512, 1024]
+        assert [row["frames"] for row in run["history"]] == [256, 512]
         for estimate, low, high in run["evaluation"].values():
             assert low <= estimate <= high
         assert list((out / "logs").rglob(f"*{name}*"))
