@@ -69,12 +69,11 @@ def _unit(rows: Array, least: Array, lower: Array, upper: Array) -> tuple[Array,
     # What does not depend on x always holds, or never: it is then a row that nothing satisfies.
     flat = lengths <= _PARALLEL
     scale = 1 / np.where(flat, 1.0, lengths)
-    rows = np.where(flat[..., None], 0.0, rows * scale[..., None])
-    each = np.broadcast_to(np.eye(rows.shape[2]), (len(rows), *2 * rows.shape[2:]))
-    return (
-        np.concatenate([rows, each, -each], axis=1),
-        np.concatenate([least * scale, lower, -upper], axis=1),
-    )
+    count, given, width = rows.shape
+    each = np.empty((count, given + 2 * width, width))
+    each[:, :given] = np.where(flat[..., None], 0.0, rows * scale[..., None])
+    each[:, given:] = np.concatenate([np.eye(width), -np.eye(width)])
+    return each, np.concatenate([least * scale, lower, -upper], axis=1)
 
 
 def _active_set(
@@ -90,48 +89,54 @@ def _active_set(
     multipliers = np.abs(push)
     active = rows.shape[1] - np.where(push > 0, 2, 1) * width + joint
     active[push == 0] = -1
+    # Those that are active are not looked at until they are dropped.
+    watched = least.copy()
+    index, slot = (active >= 0).nonzero()
+    watched[index, active[index, slot]] = -np.inf
     # The constraint that is being added, and its multiplier so far.
     entering, weight = np.full(count, -1), np.zeros(count)
+    never = np.full((count, width), np.inf)
     solved, open_ = np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
     for _ in range(_ITERATIONS_PER_UNKNOWN * width):
-        slack = (rows @ point[:, :, None])[:, :, 0] - least
-        held = active >= 0
-        index, slot = held.nonzero()
-        slack[index, active[index, slot]] = np.inf
+        slack = (rows @ point[:, :, None])[:, :, 0] - watched
         entering = np.where(entering < 0, slack.argmin(axis=1), entering)
         missing = slack[each, entering]
         solved |= open_ & (missing >= -_TOLERANCE)
         open_ &= ~solved
         if not open_.any():
             break
-        normal = rows[each, entering]
+        normal, held = rows[each, entering], active >= 0
         # The part of it that the active ones do not span, and how much of each is in the rest.
         gram = normals @ normals.transpose(0, 2, 1)
-        gram[:, joint, joint] += ~held
+        np.einsum("kii->ki", gram)[:] += ~held
         shares, singular = _solve(gram, normals @ normal[:, :, None])
         free = normal - (normals * shares[:, :, None]).sum(axis=1)
         length = (free * normal).sum(axis=1)
-        new = length > _SPANNED
         # How far until the constraint holds, or the multiplier of an active one is used up.
-        shrinks = held & (shares > _PARALLEL)
-        limits = np.where(shrinks, multipliers / np.where(shrinks, shares, 1.0), np.inf)
+        full = np.divide(-missing, length, out=never[:, 0].copy(), where=length > _SPANNED)
+        limits = np.divide(multipliers, shares, out=never.copy(), where=shares > _PARALLEL)
         last = limits.argmin(axis=1)
-        full = np.where(new, -missing / np.where(new, length, 1.0), np.inf)
-        step = np.minimum(full, limits[each, last])
+        limit = limits[each, last]
+        step = np.minimum(full, limit)
         # Neither will ever happen: there is no solution.
         open_ &= np.isfinite(step) & ~singular
         step = np.where(open_, step, 0.0)
         point = point + np.where(length > _PARALLEL, step, 0.0)[:, None] * free
-        multipliers -= np.where(held, step[:, None] * shares, 0.0)
+        multipliers -= step[:, None] * shares
         weight += step
-        joins = np.flatnonzero(open_ & (full <= limits[each, last]))
-        drops = np.flatnonzero(open_ & (full > limits[each, last]))
+        joins, drops = (
+            np.flatnonzero(open_ & (full <= limit)),
+            np.flatnonzero(open_ & (full > limit)),
+        )
         # Into the first slot that is not taken: there is one, for the others do not span it.
         slot = held[joins].argmin(axis=1)
         normals[joins, slot], multipliers[joins, slot] = normal[joins], weight[joins]
-        active[joins, slot] = entering[joins]
+        active[joins, slot] = added = entering[joins]
+        watched[joins, added] = -np.inf
         entering[joins], weight[joins] = -1, 0.0
         slot = last[drops]
+        gone = active[drops, slot]
+        watched[drops, gone] = least[drops, gone]
         normals[drops, slot], multipliers[drops, slot], active[drops, slot] = 0.0, 0.0, -1
     # Those that are active have not been looked at again.
     return point, solved & ((rows @ point[:, :, None])[:, :, 0] >= least - _ROUNDING).all(axis=1)

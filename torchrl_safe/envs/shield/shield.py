@@ -52,13 +52,10 @@ class _Pairs(NamedTuple):
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
     joints: Array
     fingers: Array
+    #: By how much all joints together can change it, m/rad, ``(k, r)``.
+    lever: Array
     #: Numbers of the obstacles, then of the table, then of what holds for the tool, ``(r,)``.
     other: NDArray[np.int_]
-
-    def of(self, rows: NDArray[np.int_]) -> _Pairs:
-        """Those of some worlds."""
-        room, spare, closing, joints, fingers, other = self
-        return _Pairs(room[rows], spare[rows], closing[rows], joints[rows], fingers[rows], other)
 
 
 class _Step(NamedTuple):
@@ -231,9 +228,9 @@ class Shield:
         if len(again):
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
             turned = (then.joints @ change[again][:, :, None])[:, :, 0]
-            needed = _needed(near.of(again), then) + turned
+            needed = _needed((near.room - near.spare)[again], then) + turned
             # One more step like this one, slowed as far as possible, has to be safe there.
-            needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.joints))
+            needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.lever))
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
             # What satisfies these too is the solution of both.
@@ -280,8 +277,9 @@ class Shield:
             # An obstacle that goes away may stop at any time.
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
-        spare = self._spare(step, room, joints)
-        return _Pairs(room, spare, closing, joints, moved, near.other)
+        lever = _lever(joints)
+        spare = self._spare(step, room, lever)
+        return _Pairs(room, spare, closing, joints, moved, lever, near.other)
 
     def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
         """Which arms have less than half of a margin left, ``(N,)``.
@@ -293,18 +291,18 @@ class Shield:
         least = -np.where(table, self.table, self.margin) / 2
         return np.any(now.room < least, axis=1)
 
-    def _spare(self, step: _Step, room: Array, joints: Array) -> Array:
+    def _spare(self, step: _Step, room: Array, lever: Array) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
         share = step.share * room
-        brake = self._brake(step, joints)
+        brake = self._brake(step, lever)
         some = np.where(np.isfinite(room), np.maximum(room, 0), 0.0)
         # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
         stops = np.sqrt(brake * (brake / 4 + 2 * some)) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
 
-    def _brake(self, step: _Step, joints: Array) -> Array:
+    def _brake(self, step: _Step, lever: Array) -> Array:
         """How much less distances can shrink in a step than in the one before, m, ``(k, r)``."""
-        return self.acceleration * step.duration**2 * _SURE * np.abs(joints).sum(axis=2)
+        return self.acceleration * step.duration**2 * _SURE * lever
 
     def _least(self, step: _Step, now: _Pairs) -> Array:
         """By how much each distance has to change at least, m, ``(N, r)``."""
@@ -323,8 +321,9 @@ class Shield:
         upper = np.clip(state.joint_upper - angles, -longest, longest)
         # A joint misses its target by less than its velocity was to change.
         # So all together change no distance by more than is left of it.
-        levers = np.maximum(np.abs(now.joints).sum(axis=2), _SHORTEST)
-        slack = (np.maximum(now.room, 0) / levers).min(axis=1, initial=np.inf)
+        slack = (np.maximum(now.room, 0) / np.maximum(now.lever, _SHORTEST)).min(
+            axis=1, initial=np.inf
+        )
         slack = np.maximum(slack, self.acceleration * step.duration**2)[:, None]
         return (
             np.clip(turning - slack, np.maximum(lower, -_FAR), upper),
@@ -348,7 +347,7 @@ class Shield:
             tool, ways = step.state.ee_position, np.concatenate([linear, -linear], axis=1)
             left = np.concatenate([tool - walls.low, walls.high - tool], axis=1) - self.margin
             room = np.concatenate([room, left], axis=1)
-            spare = np.concatenate([spare, self._spare(step, left, ways)], axis=1)
+            spare = np.concatenate([spare, self._spare(step, left, _lever(ways))], axis=1)
             joints = np.concatenate([joints, ways], axis=1)
         number = step.state.obstacle_position.shape[1] + 1
         return _Pairs(
@@ -357,18 +356,30 @@ class Shield:
             closing=np.concatenate([near.closing, np.zeros_like(room)], axis=1),
             joints=np.concatenate([near.joints, joints], axis=1),
             fingers=np.pad(near.fingers, [(0, 0), (0, room.shape[1]), (0, 0)]),
+            lever=np.concatenate([near.lever, _lever(joints)], axis=1),
             other=np.append(near.other, np.full(room.shape[1], number)),
         )
 
 
-def _needed(now: _Pairs, then: _Pairs) -> Array:
-    """How much further apart each pair at the end of a step has to be than it is, m, ``(k, r)``."""
+def _lever(joints: Array) -> Array:
+    """By how much all joints together can change a distance, m/rad, ``(k, r)``."""
+    return np.abs(joints).sum(axis=2)
+
+
+def _needed(kept: Array, then: _Pairs) -> Array:
+    """How much further apart each pair at the end of a step has to be than it is, m, ``(k, r)``.
+
+    Args:
+        kept: the room that the step has to leave each pair, m, ``(k, r)``.
+        then: the pairs at its end.
+    """
     # Each shape may use up what the nearest one may.
-    kept = np.zeros((len(now.room), now.other.max(initial=0) + 1))
-    for other in range(kept.shape[1]):
-        nearest = (now.room - now.spare)[:, now.other == other].min(axis=1, initial=np.inf)
-        kept[:, other] = np.where(np.isfinite(nearest), nearest, 0.0)
-    return kept[:, then.other] + then.closing - then.room
+    least = np.zeros_like(kept)
+    for other in range(then.other.max(initial=-1) + 1):
+        same = then.other == other
+        nearest = kept[:, same].min(axis=1, keepdims=True, initial=np.inf)
+        least[:, same] = np.where(np.isfinite(nearest), nearest, 0.0)
+    return least + then.closing - then.room
 
 
 def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
@@ -376,7 +387,7 @@ def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
 
     The middle of the bounds is how they turn now. What is left of a wish is not coming nearer.
     """
-    best = np.where(rows > 0, rows * upper[:, None], rows * lower[:, None]).sum(axis=2)
+    best = np.maximum(rows * upper[:, None], rows * lower[:, None]).sum(axis=2)
     middle = (rows @ (0.5 * (lower + upper))[:, :, None])[:, :, 0]
     return np.minimum(least, np.maximum((best + np.maximum(middle, 0)) / 2, 0))
 
