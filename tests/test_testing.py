@@ -543,6 +543,7 @@ def test_global_random_numbers_are_left_alone():
     sac = partial(SACLoss, target_entropy=-2.0)
     testing.check_equals_at_zero(OFF_POLICY["sac"], sac, num_updates=1, **off_policy("sac"))
     testing.check_state_dict(OFF_POLICY["td3"], **off_policy("td3"))
+    testing.train_on_bandit(partial(PPOLagrangianLoss, entropy_bonus=False), num_batches=1)
     assert torch.equal(torch.get_rng_state(), state)
 
 

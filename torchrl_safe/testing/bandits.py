@@ -17,6 +17,7 @@ from torchrl.modules import OneHotCategorical, ProbabilisticActor, ValueOperator
 from torchrl.objectives import LossModule
 
 from torchrl_safe.testing._losses import require, total
+from torchrl_safe.testing._random import seeded
 
 with warnings.catch_warnings():  # TorchRL 0.14 deprecates a base class that it still derives from.
     warnings.filterwarnings("ignore", "Creating .* WeightUpdaterBase", DeprecationWarning)
@@ -233,7 +234,8 @@ def train_on_bandit(
         num_batches (int, optional): batches of 512 episodes. Defaults to ``80``.
         num_costs (int, optional): ``2``, or ``1`` to leave out the cost that never binds.
         lr (float, optional): learning rate of gradient descent. Defaults to ``0.1``.
-        seed (int, optional): seed of weights, actions and minibatches. Seeds the global generator.
+        seed (int, optional): seed of weights, actions and minibatches. Leaves the global generator
+            as it was.
         learn (callable, optional): what is done with a batch, called with loss, optimizer and
             replay buffer. Defaults to two epochs in minibatches of 256.
         read (callable, optional): what to read from the loss after each batch.
@@ -251,33 +253,35 @@ def train_on_bandit(
         >>> shares.shape, multipliers.shape
         (torch.Size([3]), torch.Size([3, 2]))
     """
-    torch.manual_seed(seed)
-    env = ConstrainedBandit(num_costs)
-    actor, critic, cost_critic = env.make_networks()
-    loss = make_loss(actor, critic, cost_critic, num_costs=num_costs)
-    updater = make_updater(loss, cost_limit=env.cost_limit) if make_updater else None
-    optimizer = torch.optim.SGD(loss.parameters(), lr=lr)
-    size = env.batch_size.numel()
-    collector = Collector(
-        env,
-        actor,
-        frames_per_batch=size,
-        total_frames=num_batches * size,
-        auto_register_policy_transforms=False,
-    )
-    buffer = ReplayBuffer(
-        storage=LazyTensorStorage(size), sampler=SamplerWithoutReplacement(), batch_size=size // 2
-    )
-    shares, readings = [], []
-    for batch in collector:
-        if updater is not None:
-            # Every episode is one step long: its cost is the cost of the step.
-            updater.step(batch["next", "cost"][batch["next", "done"].squeeze(-1)])
-        buffer.extend(loss.estimate_advantages(batch).reshape(-1))
-        learn(loss, optimizer, buffer)
-        shares.append(batch["action"][..., 0].float().mean())
-        readings.append((read(loss) if read else loss.lagrange_multiplier).clone())
-    collector.shutdown()
+    with seeded(seed):
+        env = ConstrainedBandit(num_costs)
+        actor, critic, cost_critic = env.make_networks()
+        loss = make_loss(actor, critic, cost_critic, num_costs=num_costs)
+        updater = make_updater(loss, cost_limit=env.cost_limit) if make_updater else None
+        optimizer = torch.optim.SGD(loss.parameters(), lr=lr)
+        size = env.batch_size.numel()
+        collector = Collector(
+            env,
+            actor,
+            frames_per_batch=size,
+            total_frames=num_batches * size,
+            auto_register_policy_transforms=False,
+        )
+        buffer = ReplayBuffer(
+            storage=LazyTensorStorage(size),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=size // 2,
+        )
+        shares, readings = [], []
+        for batch in collector:
+            if updater is not None:
+                # Every episode is one step long: its cost is the cost of the step.
+                updater.step(batch["next", "cost"][batch["next", "done"].squeeze(-1)])
+            buffer.extend(loss.estimate_advantages(batch).reshape(-1))
+            learn(loss, optimizer, buffer)
+            shares.append(batch["action"][..., 0].float().mean())
+            readings.append((read(loss) if read else loss.lagrange_multiplier).clone())
+        collector.shutdown()
     return torch.stack(shares), torch.stack(readings)
 
 
