@@ -51,6 +51,14 @@ def turntable(tmp_path):
 
 
 @pytest.fixture
+def threads():
+    """Scripts set the number of PyTorch's threads; puts it back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def forked_workers():
     """TorchRL makes spawning the default, which takes seconds for each worker."""
     before = multiprocessing.get_start_method()

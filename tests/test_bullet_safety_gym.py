@@ -74,6 +74,7 @@ def test_made_by_name(make_env, monkeypatch, num_envs):
     assert env.rollout(3)["next", "cost"].shape == (*env.batch_size, 3, 1)
 
 
+@pytest.mark.usefixtures("threads")
 def test_the_recipe(tmp_path, monkeypatch):
     use_real_streams(monkeypatch)
     small = safe_gym.Config(

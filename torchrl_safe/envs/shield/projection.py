@@ -124,10 +124,8 @@ def _active_set(
         point = point + np.where(length > _PARALLEL, step, 0.0)[:, None] * free
         multipliers -= step[:, None] * shares
         weight += step
-        joins, drops = (
-            np.flatnonzero(open_ & (full <= limit)),
-            np.flatnonzero(open_ & (full > limit)),
-        )
+        joins = np.flatnonzero(open_ & (full <= limit))
+        drops = np.flatnonzero(open_ & (full > limit))
         # Into the first slot that is not taken: there is one, for the others do not span it.
         slot = held[joins].argmin(axis=1)
         normals[joins, slot], multipliers[joins, slot] = normal[joins], weight[joins]

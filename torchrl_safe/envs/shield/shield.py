@@ -321,9 +321,8 @@ class Shield:
         upper = np.clip(state.joint_upper - angles, -longest, longest)
         # A joint misses its target by less than its velocity was to change.
         # So all together change no distance by more than is left of it.
-        slack = (np.maximum(now.room, 0) / np.maximum(now.lever, _SHORTEST)).min(
-            axis=1, initial=np.inf
-        )
+        lever = np.maximum(now.lever, _SHORTEST)
+        slack = (np.maximum(now.room, 0) / lever).min(axis=1, initial=np.inf)
         slack = np.maximum(slack, self.acceleration * step.duration**2)[:, None]
         return (
             np.clip(turning - slack, np.maximum(lower, -_FAR), upper),
