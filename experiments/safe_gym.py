@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import islice
 from pathlib import Path
 from time import strftime
@@ -160,8 +160,14 @@ class Standardize(torch.nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()
-    def update(self, observation: Tensor) -> None:
-        """Adds observations, shape ``(*B, width)``, to those that were shown before."""
+    def update(self, observation: Tensor, layers: Iterable[torch.nn.Linear] = ()) -> None:
+        """Adds observations to those that were shown before.
+
+        Args:
+            observation: of shape ``(*B, width)``.
+            layers: what reads the standardized observations. Their outputs stay what they were.
+        """
+        before, unit = self.mean.clone(), self.std.clone()
         rows = observation.reshape(-1, observation.shape[-1]).double()
         share = len(rows) / (self.count + len(rows))
         var, mean = torch.var_mean(rows, 0, correction=0)
@@ -170,6 +176,14 @@ class Standardize(torch.nn.Module):
         self.std.copy_(var.sqrt().clamp_min(1e-8))
         self.mean.lerp_(mean, share)
         self.count.add_(len(rows))
+        # Networks have learnt nothing about what hardly varied so far: its weights stay.
+        ratio = self.std / unit
+        known = ratio < 2
+        ratio = torch.where(known, ratio, 1.0)
+        shift = torch.where(known, (self.mean - before) / unit, 0.0).to(unit.dtype)
+        for layer in layers:
+            layer.bias.add_(layer.weight @ shift)
+            layer.weight.mul_(ratio)
 
     def forward(self, observation: Tensor) -> Tensor:
         return ((observation - self.mean) / self.std).clamp(-10, 10).to(self.std.dtype)
@@ -341,6 +355,13 @@ class Learner:
         self.loss.make_value_estimator(ValueEstimators.GAE, **discount)
         self.loss.make_cost_value_estimator(**discount)
         self.policy = list(agent.actor.parameters())
+        # New statistics alone would change the policy: one that keeps just below a speed limit
+        # would exceed it after each batch, and the multiplier keep rising.
+        readers = agent.explorer, agent.critic, agent.cost_critic
+        self.first_layers = [
+            next(part for part in network.modules() if isinstance(part, torch.nn.Linear))
+            for network in readers
+        ]
         self.optimizer = torch.optim.Adam(
             self.loss.parameters(), lr=config.learning_rate, fused=True
         )
@@ -378,7 +399,7 @@ class Learner:
             self._descend(self.projection, data, moved_from_here(self.agent.actor, data))
         self.schedule.step()
         # Last: the policy that collected the batch is the one that learnt from it.
-        self.agent.standardize.update(batch["observation"])
+        self.agent.standardize.update(batch["observation"], self.first_layers)
         return kl
 
     def _descend(

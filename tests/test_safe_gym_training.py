@@ -84,9 +84,9 @@ def test_statistics_are_of_all_observations_and_frozen_in_evaluation(tmp_path, m
     shown = []
     update = Standardize.update
 
-    def remember(self, observation):
+    def remember(self, observation, *layers):
         shown.append(observation.reshape(-1, 2).double())
-        update(self, observation)
+        update(self, observation, *layers)
 
     monkeypatch.setattr(Standardize, "update", remember)
     agent, _ = train(replace(SMALL, out=tmp_path), progress=False)
@@ -99,6 +99,46 @@ def test_statistics_are_of_all_observations_and_frozen_in_evaluation(tmp_path, m
     safe_gym.evaluate(env, agent.actor, 2, seed=0)
     env.close()
     assert torch.equal(agent.standardize.mean, before)
+
+
+def test_new_statistics_leave_the_networks_as_they_were():
+    """The second observation hardly varied before: its weight stays, in the new unit."""
+    standardize, layer = Standardize(2), torch.nn.Linear(2, 3)
+    seen = torch.tensor([[0.0, 5.0], [2.0, 5.0]], dtype=torch.float64)
+    standardize.update(seen)
+    observations = torch.tensor([[0.5, 5.0], [-1.0, 5.0]])
+    before, weight = layer(standardize(observations)), layer.weight.clone()
+    standardize.update(torch.tensor([[1.0, 5.0], [5.0, 7.0]], dtype=torch.float64), [layer])
+    assert standardize.mean.tolist() == [2.0, 5.5]
+    torch.testing.assert_close(layer.weight[:, 1], weight[:, 1])
+    torch.testing.assert_close(layer.weight[:, 0], weight[:, 0] * 3.5**0.5)
+    # The second observation is now 5, or 0.58 deviations below its mean.
+    moved = layer(standardize(observations)) - before
+    torch.testing.assert_close(moved, (-weight[:, 1] / 3**0.5).expand(2, 3))
+
+
+def test_statistics_change_neither_policy_nor_critics(tmp_path, monkeypatch):
+    update, apart = Standardize.update, []
+    agents = []
+    monkeypatch.setattr(
+        safe_gym, "make_agent", lambda *args: agents.append(make_agent(*args)) or agents[0]
+    )
+
+    def compare(self, observation, layers=()):
+        agent = agents[0]
+        rows = observation.reshape(-1, 2)
+        networks = agent.explorer.module.policy, agent.critic.module, agent.cost_critic.module
+        before = [network(rows) for network in networks]
+        update(self, observation, layers)
+        after = [network(rows) for network in networks]
+        if layers:
+            torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4)
+            apart.append(self.mean.clone())
+
+    monkeypatch.setattr(Standardize, "update", compare)
+    train(replace(SMALL, out=tmp_path), progress=False)
+    assert len(apart) == 5
+    assert not torch.equal(apart[0], apart[4])
 
 
 @pytest.mark.parametrize(
