@@ -165,7 +165,8 @@ class Standardize(torch.nn.Module):
 
         Args:
             observation: of shape ``(*B, width)``.
-            layers: what reads the standardized observations. Their outputs stay what they were.
+            layers: what reads the standardized observations. Their outputs stay what they were,
+                but for observations that hardly varied so far.
         """
         before, unit = self.mean.clone(), self.std.clone()
         rows = observation.reshape(-1, observation.shape[-1]).double()
@@ -176,7 +177,7 @@ class Standardize(torch.nn.Module):
         self.std.copy_(var.sqrt().clamp_min(1e-8))
         self.mean.lerp_(mean, share)
         self.count.add_(len(rows))
-        # Networks have learnt nothing about what hardly varied so far: its weights stay.
+        # Networks have learnt nothing about those, and their weights would become too large.
         ratio = self.std / unit
         known = ratio < 2
         ratio = torch.where(known, ratio, 1.0)

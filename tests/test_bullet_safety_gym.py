@@ -29,7 +29,10 @@ NAMES = [
 
 
 def use_real_streams(monkeypatch):
-    """It silences PyBullet by the names of these two, which pytest's do not have."""
+    """It silences PyBullet by the names of these two, which pytest's do not have.
+
+    A fixture would be too early: pytest sets its own once more before it calls the test.
+    """
     monkeypatch.setattr(sys, "stdout", sys.__stdout__)
     monkeypatch.setattr(sys, "stderr", sys.__stderr__)
 

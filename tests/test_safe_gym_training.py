@@ -118,27 +118,23 @@ def test_new_statistics_leave_the_networks_as_they_were():
 
 
 def test_statistics_change_neither_policy_nor_critics(tmp_path, monkeypatch):
-    update, apart = Standardize.update, []
-    agents = []
-    monkeypatch.setattr(
-        safe_gym, "make_agent", lambda *args: agents.append(make_agent(*args)) or agents[0]
-    )
+    """Without a learning rate to speak of, nothing else does."""
+    learn, means = safe_gym.Learner.learn, []
 
-    def compare(self, observation, layers=()):
-        agent = agents[0]
-        rows = observation.reshape(-1, 2)
+    def compare(self, batch):
+        agent, rows = self.agent, batch["observation"].clone()
         networks = agent.explorer.module.policy, agent.critic.module, agent.cost_critic.module
         before = [network(rows) for network in networks]
-        update(self, observation, layers)
+        kl = learn(self, batch)
         after = [network(rows) for network in networks]
-        if layers:
-            torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4)
-            apart.append(self.mean.clone())
+        torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4)
+        means.append(agent.standardize.mean.clone())
+        return kl
 
-    monkeypatch.setattr(Standardize, "update", compare)
-    train(replace(SMALL, out=tmp_path), progress=False)
-    assert len(apart) == 5
-    assert not torch.equal(apart[0], apart[4])
+    monkeypatch.setattr(safe_gym.Learner, "learn", compare)
+    train(replace(SMALL, learning_rate=1e-12, out=tmp_path), progress=False)
+    assert len(means) == 5
+    assert not torch.equal(means[0], means[4])
 
 
 @pytest.mark.parametrize(
