@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
+from time import process_time
 from typing import Any
 
 import gymnasium
@@ -80,16 +81,22 @@ def modules() -> dict[str, tuple[nn.Module, Callable[..., Tensor]]]:
     }
 
 
-def contenders(minibatch: TensorDictBase, kind: str, steps: int) -> dict[str, Contender]:
-    """The three updates by name, each already compiled where it is to be."""
+def contenders(
+    minibatch: TensorDictBase,
+    kind: str,
+    steps: int,
+    clock: Callable[[], float] = process_time,
+) -> dict[str, Contender]:
+    """The three updates by name, where the minibatch is, each already compiled if it is to be."""
     found = {}
     for name, (module, objective) in modules().items():
+        module.to(minibatch.device)
         inputs = arguments(minibatch) if name == "hand-written" else (minibatch,)
         if kind != "eager":
             objective = torch.compile(objective, fullgraph=True, dynamic=False)
         step = update(module, partial(objective, *inputs))
         step()
-        contender = timed(step, calls=steps)
+        contender = timed(step, calls=steps, clock=clock)
         found[f"{name}, {kind}"] = contender if "skipped" not in kind else unguarded(contender)
     return found
 
