@@ -12,8 +12,17 @@ from tensordict.nn import (
 )
 from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, PPOLoss, ReinforceLoss
 
-from torchrl_safe.objectives import PPOLagrangianLoss
+from torchrl_safe.objectives import (
+    CRPOLoss,
+    FOCOPSLoss,
+    IPOLoss,
+    LagrangianLoss,
+    P3OLoss,
+    PPOLagrangianLoss,
+    TrustRegionLoss,
+)
 from torchrl_safe.testing import OBSERVATION_SIZE, make_batch, make_critic, make_networks
 from torchrl_safe.testing.networks import mlp
 
@@ -95,6 +104,25 @@ def around(kind, parent):
         return kind(parent(actor, critic, **options), cost_critic, **own)
 
     return make
+
+
+# What constrains each loss: its multipliers.
+BY_MULTIPLIER = {
+    "ppo-lagrangian": PPOLagrangianLoss,
+    "a2c": around(LagrangianLoss, A2CLoss),
+    "reinforce": around(LagrangianLoss, ReinforceLoss),
+    "ppo": around(LagrangianLoss, PPOLoss),
+    "kl-ppo": around(LagrangianLoss, KLPENPPOLoss),
+    # The batch is of another policy, far outside the trust region of FOCOPS.
+    "focops": partial(FOCOPSLoss, kl_bound=1.0),
+    "trust-region": TrustRegionLoss,
+}
+# These have no multipliers.
+BY_VIOLATION = {
+    "p3o": P3OLoss,
+    "ipo": IPOLoss,
+    "crpo": around(CRPOLoss, ClipPPOLoss),
+}
 
 
 def parameters(loss, network):

@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from experiments import compiling, evaluate, safe_gym, safe_gym_grid
 from experiments.files import run_to_resume
 from experiments.safe_gym import Config, Critic, Standardize, main, make_agent, make_env, train
-from torchrl_safe.objectives import PPOLagrangianLoss
+from torchrl_safe.objectives import PIDControl, PPOLagrangianLoss
 from torchrl_safe.policy import load_policy
 from torchrl_safe.testing import make_networks
 
@@ -371,6 +371,7 @@ def test_the_gain_is_that_of_the_rule(ki):
     updater = safe_gym.make_updater(replace(SMALL, cost_limit=(1.0,), ki=ki), loss)
     updater.step(torch.tensor([[5.0], [5.0]]))
     assert loss.lagrange_multiplier.item() == pytest.approx(1 + ki)
+    assert Config.ki == PIDControl(loss, cost_limit=1.0).ki
 
 
 def test_episodes_that_never_end(tmp_path):

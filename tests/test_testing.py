@@ -8,24 +8,20 @@ from functools import partial
 import pytest
 import torch
 from off_policy import TRAINS as Q_TRAINS
-from on_policy import TRAINS, around
+from on_policy import BY_MULTIPLIER, BY_VIOLATION, TRAINS
 from torchrl.objectives import (
     A2CLoss,
     ClipPPOLoss,
-    KLPENPPOLoss,
     PPOLoss,
-    ReinforceLoss,
     SACLoss,
 )
 
 from torchrl_safe import testing
 from torchrl_safe.objectives import (
-    CRPOLoss,
     CUPLoss,
     DualAscent,
     FOCOPSLoss,
     IPOLoss,
-    LagrangianLoss,
     P3OLoss,
     PIDControl,
     PPOLagrangianLoss,
@@ -35,25 +31,6 @@ from torchrl_safe.objectives import (
 )
 
 # ---------------------------------------------------------------- ours pass
-
-
-BY_MULTIPLIER = {
-    "ppo-lagrangian": PPOLagrangianLoss,
-    "a2c": around(LagrangianLoss, A2CLoss),
-    "reinforce": around(LagrangianLoss, ReinforceLoss),
-    "ppo": around(LagrangianLoss, PPOLoss),
-    "kl-ppo": around(LagrangianLoss, KLPENPPOLoss),
-    # The batch is of another policy, far outside the trust region of FOCOPS.
-    "focops": partial(FOCOPSLoss, kl_bound=1.0),
-    "trust-region": TrustRegionLoss,
-}
-
-
-BY_VIOLATION = {
-    "p3o": P3OLoss,
-    "ipo": IPOLoss,
-    "crpo": around(CRPOLoss, ClipPPOLoss),
-}
 
 
 OFF_POLICY = {
