@@ -1,5 +1,7 @@
 """PIDControl with its defaults: relative violations, by hand and at the bounds."""
 
+import math
+
 import pytest
 import torch
 from rules import make_module
@@ -36,15 +38,32 @@ def test_pessimism_adds_standard_errors():
 
 
 @pytest.mark.parametrize("limit", [0.025, 25.0, 25_000.0])
-def test_a_limit_that_is_far_away_is_answered_within_twenty_batches(limit):
-    """From nothing to a weight of the costs of five sixths, and back at the same pace."""
+def test_a_limit_that_is_far_away_is_answered_within_twelve_batches(limit):
+    """Above 1 by a factor of e ** 0.2 in each batch, to the bound, and back at the same pace."""
     updater = make_updater(cost_limit=limit)
-    for _ in range(20):
-        step(updater, 50 * limit, 50 * limit)
-    assert multiplier(updater).item() == pytest.approx(5.0)
-    for _ in range(20):
-        step(updater, 0.0, 0.0)
-    assert multiplier(updater).item() == 0
+    up = [step(updater, 50 * limit, 50 * limit).item() for _ in range(12)]
+    assert up == pytest.approx([math.exp(0.2 * batch) for batch in range(1, 12)] + [10])
+    # The integral is 2.4; each batch takes 0.2 off it, and the proportional part 1 off the sum.
+    sums = [1.4 - 0.2 * batch for batch in range(1, 8)]
+    down = [step(updater, 0.0, 0.0).item() for _ in sums]
+    expected = [math.exp(value - 1) if value > 1 else max(value, 0) for value in sums]
+    assert down == pytest.approx(expected, abs=1e-6)
+    assert down[-1] == 0
+
+
+def test_an_assigned_multiplier_is_where_the_next_step_starts():
+    # v is 1/2, so the sum rises by 0.1 in each batch, and e ** 0.1 is the factor above 1.
+    updater = make_updater(kp=0.0)
+    for start, expected in [(0.5, 0.6), (0.95, math.exp(0.05)), (4.0, 4 * math.exp(0.1))]:
+        multiplier(updater).fill_(start)
+        torch.testing.assert_close(step(updater, 11.0), torch.tensor([expected]))
+
+
+def test_without_a_bound_it_stays_finite():
+    updater = make_updater(max_multiplier=None)
+    for _ in range(1000):
+        step(updater, 500.0)  # Finite, or the updater would refuse it.
+    assert multiplier(updater).item() > 1e30
 
 
 def test_it_winds_up_no_further_than_its_bounds():
@@ -52,7 +71,7 @@ def test_it_winds_up_no_further_than_its_bounds():
     for _ in range(1000):
         assert step(updater, 500.0) <= 20
     # The first batch within the limit is answered.
-    torch.testing.assert_close(step(updater, 0.0), torch.tensor([20 - 0.6]))
+    torch.testing.assert_close(step(updater, 0.0), torch.tensor([20 * math.exp(-0.6)]))
     for _ in range(1000):
         assert step(updater, 0.0) >= 0
     torch.testing.assert_close(step(updater, 500.0), torch.tensor([0.6]))

@@ -22,17 +22,27 @@ class PIDControl(MultiplierUpdater):
     :math:`\bar J`, each batch does
 
     .. math::
-        I &\leftarrow \mathrm{clip}(I + k_i (J - d),\ 0,\ \mathrm{max}) \\
-        \lambda &\leftarrow \mathrm{clip}(I + k_p (\bar J - d)
-            + k_d (\bar J - \bar J_\mathrm{previous})_+,\ 0,\ \mathrm{max})
+        I &\leftarrow \max(I + k_i (J - d),\ 0) \\
+        u &\leftarrow I + k_p (\bar J - d) + k_d (\bar J - \bar J_\mathrm{previous})_+ \\
+        \lambda &\leftarrow \mathrm{clip}(u \text{ if } u \le 1 \text{ else } e^{u - 1},\
+            0,\ \mathrm{max})
 
-    **The defaults have no unit.** Far above the limit the multiplier is 1.2 after the first batch
-    and 5 after twenty, whether costs are thousands or thousandths. It is bounded: without a bound
-    it could grow until the reward has no weight, before the task is learnt. The defaults need
-    advantages without a unit, which the losses have by default (``normalize_cost_advantage``). With
-    ``normalize=False`` the gains are in multiplier per unit of cost, as published, and need tuning.
+    **Above 1 the multiplier moves by factors.** The losses weigh the reward by
+    :math:`1 / (1 + \lambda)`, so from 5 to 6 changes much less than from 0 to 1. With steps of the
+    same size, a limit that takes a multiplier of 8 would not be met in 50 batches. The integral
+    stops where :math:`\lambda` is at its bound.
 
-    The integral alone is :class:`~torchrl_safe.objectives.DualAscent` with ``lr = ki``. It lags
+    **The defaults have no unit.** Far above the limit the multiplier is 1.2 after the first batch,
+    3 after six and at its bound of 10 after twelve, whether costs are thousands or thousandths. It
+    is bounded: without a bound it could grow until the reward has no weight, before the task is
+    learnt. The defaults need advantages without a unit, which the losses have by default
+    (``normalize_cost_advantage``).
+
+    **As published**, with ``normalize=False``, :math:`\lambda` is :math:`u` clipped, the gains are
+    in multiplier per unit of cost, and need tuning.
+
+    With ``normalize=False`` the integral alone is
+    :class:`~torchrl_safe.objectives.DualAscent` with ``lr = ki``. An integral lags
     behind the policy, so cost and multiplier circle round their optimum. The proportional term
     damps that. The derivative term reacts to a rising cost before the limit is exceeded, and does
     not react to a falling one. The integral stays within the bounds of the multiplier, so it leaves
@@ -63,7 +73,8 @@ class PIDControl(MultiplierUpdater):
             the first batch counts as a rise). Defaults to ``0.0``, the cost itself, as there.
         max_multiplier (float, optional): see :class:`MultiplierUpdater`. Defaults to ``10.0``.
         pessimism (float, optional): see :class:`MultiplierUpdater`. Defaults to ``2.0``.
-        normalize (bool, optional): see :class:`MultiplierUpdater`. Defaults to ``True``.
+        normalize (bool, optional): make violations relative (see :class:`MultiplierUpdater`), and
+            steps relative to a multiplier above 1. Defaults to ``True``.
         cost_names (sequence of str, optional): see :class:`MultiplierUpdater`.
 
     Raises:
@@ -125,7 +136,7 @@ class PIDControl(MultiplierUpdater):
             raise ValueError(f"smoothing must be at least 0 and less than 1, got {smoothing!r}.")
         self.smoothing = as_number(smoothing)
         multiplier = loss_module.lagrange_multiplier
-        self.integral = multiplier.clone()
+        self.integral = self._parameter(multiplier)
         # NaN until there has been a batch.
         self.smoothed_cost = torch.full_like(multiplier, float("nan"))
         self.last_multiplier = multiplier.clone()
@@ -139,15 +150,31 @@ class PIDControl(MultiplierUpdater):
         previous = torch.where(previous.isnan(), cost, previous)
         smoothed = cost.lerp(previous, self.smoothing)
         # As in DualAscent, an assigned or loaded multiplier is never overwritten by a stale one.
-        assigned = multiplier - self.last_multiplier.to(multiplier)
+        last = self.last_multiplier.to(multiplier)
+        assigned = self._parameter(multiplier) - self._parameter(last)
         integral = (self.integral.to(multiplier) + assigned).add(violation, alpha=self.ki)
-        integral = integral.clamp(0, self.max_multiplier)
+        integral = integral.clamp_min(0)
+        if self.max_multiplier is not None:
+            bound = torch.full_like(multiplier, self.max_multiplier)
+            integral = integral.minimum(self._parameter(bound))
         rise = (smoothed - previous).clamp_min(0)
-        proposal = integral + self.kp * (smoothed - limit) + self.kd * rise
-        proposal = proposal.clamp(0, self.max_multiplier)
+        parameter = integral + self.kp * (smoothed - limit) + self.kd * rise
+        proposal = self._multiplier(parameter).clamp(0, self.max_multiplier)
         if proposal.isfinite().all():  # Else ``step`` refuses it, and nothing may have changed.
             self.integral, self.smoothed_cost, self.last_multiplier = integral, smoothed, proposal
         return proposal
+
+    def _parameter(self, multiplier: Tensor) -> Tensor:
+        """What the terms add up to, for a multiplier."""
+        if not self.normalize:
+            return multiplier.clone()
+        return torch.where(multiplier > 1, 1 + multiplier.log(), multiplier)
+
+    def _multiplier(self, parameter: Tensor) -> Tensor:
+        if not self.normalize:
+            return parameter
+        # Without a bound it must not overflow.
+        return torch.where(parameter > 1, (parameter.clamp_max(80) - 1).exp(), parameter)
 
     def state_dict(self) -> dict[str, Any]:
         return {
