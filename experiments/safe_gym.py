@@ -113,9 +113,6 @@ class Config:
     """Logarithm of the policy's deviation at the start, before the squashing; it is learnt."""
     gamma: float = 0.99
     """Discount of reward and costs."""
-    ki: float = 0.2
-    """How far the multiplier rises in a batch far above the limit: raise it if the multiplier is
-    still rising at the end and the cost is above the limit."""
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "checkpoint_every", "eval_episodes", "frames_per_batch")
@@ -131,10 +128,6 @@ class Config:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
         if not 0 < self.gamma < 1:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
-        if not 0 < self.ki < math.inf:
-            raise ValueError(f"ki must be positive, got {self.ki}.")
-        if self.ki != Config.ki and ALGORITHMS[self.algorithm].updater is not move_multiplier:
-            raise ValueError(f"{self.algorithm} has no multiplier that moves, got ki={self.ki}.")
         if not all(0 <= limit < math.inf for limit in self.cost_limit):
             raise ValueError(f"cost_limit must not be negative, got {self.cost_limit}.")
         if len(self.cost_limit) not in (1, len(self.cost_keys)):
@@ -346,7 +339,7 @@ def make_updater(config: Config, loss: LossModule) -> MultiplierUpdater | Violat
     if wanted is keep_multiplier:
         return None
     if wanted is move_multiplier:
-        return PIDControl(loss, cost_limit=limits, ki=config.ki)
+        return PIDControl(loss, cost_limit=limits)
     return ViolationUpdater(loss, cost_limit=limits)
 
 
