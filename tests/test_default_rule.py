@@ -39,10 +39,10 @@ def test_pessimism_adds_standard_errors():
 
 @pytest.mark.parametrize("limit", [0.025, 25.0, 25_000.0])
 def test_a_limit_that_is_far_away_is_answered_within_twelve_batches(limit):
-    """Above 1 by a factor of e ** 0.2 in each batch, to the bound, and back at the same pace."""
+    """From nothing to 11, by a factor of e ** 0.2 in each batch, and back at the same pace."""
     updater = make_updater(cost_limit=limit)
     up = [step(updater, 50 * limit, 50 * limit).item() for _ in range(12)]
-    assert up == pytest.approx([math.exp(0.2 * batch) for batch in range(1, 12)] + [10])
+    assert up == pytest.approx([math.exp(0.2 * batch) for batch in range(1, 13)])
     # The integral is 2.4; each batch takes 0.2 off it, and the proportional part 1 off the sum.
     sums = [1.4 - 0.2 * batch for batch in range(1, 8)]
     down = [step(updater, 0.0, 0.0).item() for _ in sums]
@@ -98,7 +98,7 @@ def test_it_stays_finite_and_comes_back(cost, limit):
     for episode_cost in (cost * spread, torch.tensor([[cost]])):
         for _ in range(20):
             updater.step(episode_cost)
-            assert 0 <= multiplier(updater).item() <= 10
+            assert 0 <= multiplier(updater).item() <= 100
     if limit:
         # The spread forgets a fifth in each batch: 3e20 in some 220.
         for _ in range(400):
