@@ -28,9 +28,9 @@ class PIDControl(MultiplierUpdater):
             0,\ \mathrm{max})
 
     **Above 1 the multiplier moves by factors.** The losses weigh the reward by
-    :math:`1 / (1 + \lambda)`, so from 5 to 6 changes much less than from 0 to 1. With steps of the
-    same size, a limit that takes a multiplier of 8 would not be met in 50 batches. The integral
-    stops where :math:`\lambda` is at its bound.
+    :math:`1 / (1 + \lambda)`, so from 5 to 6 changes much less than from 0 to 1. Far above the limit a
+    multiplier of 8 takes 11 batches; in steps of the same size it would take 35. The integral stops
+    where :math:`\lambda` is at its bound.
 
     **The defaults have no unit.** Far above the limit the multiplier is 1.2 after the first batch,
     3 after six, 11 after twelve and at its bound of 100 after 24, whether costs are thousands or
@@ -41,12 +41,11 @@ class PIDControl(MultiplierUpdater):
     **As published**, with ``normalize=False``, :math:`\lambda` is :math:`u` clipped, the gains are
     in multiplier per unit of cost, and need tuning.
 
-    With ``normalize=False`` the integral alone is
-    :class:`~torchrl_safe.objectives.DualAscent` with ``lr = ki``. An integral lags
-    behind the policy, so cost and multiplier circle round their optimum. The proportional term
-    damps that. The derivative term reacts to a rising cost before the limit is exceeded, and does
-    not react to a falling one. The integral stays within the bounds of the multiplier, so it leaves
-    a bound as soon as the violation changes its sign.
+    The integral alone, with ``normalize=False``, is :class:`~torchrl_safe.objectives.DualAscent`
+    with ``lr = ki``. It lags behind the policy, so cost and multiplier circle round their optimum.
+    The proportional term damps that. The derivative term reacts to a rising cost before the limit
+    is exceeded, and does not react to a falling one. The integral stays within the bounds of the
+    multiplier, so it leaves a bound as soon as the violation changes its sign.
 
     The terms of ``kp`` and ``kd`` pass the noise of the batch costs on to the multiplier. The
     derivative term only adds, so a constant cost with noise of standard deviation s raises the
