@@ -28,9 +28,9 @@ class PIDControl(MultiplierUpdater):
             0,\ \mathrm{max})
 
     **Above 1 the multiplier moves by factors.** The losses weigh the reward by
-    :math:`1 / (1 + \lambda)`, so from 5 to 6 changes much less than from 0 to 1. Far above the limit a
-    multiplier of 8 takes 11 batches; in steps of the same size it would take 35. The integral stops
-    where :math:`\lambda` is at its bound.
+    :math:`1 / (1 + \lambda)`, so from 5 to 6 changes much less than from 0 to 1. Far above the
+    limit a multiplier of 8 takes 11 batches; in steps of the same size it would take 35. The
+    integral stops where :math:`\lambda` is at its bound.
 
     **The defaults have no unit.** Far above the limit the multiplier is 1.2 after the first batch,
     3 after six, 11 after twelve and at its bound of 100 after 24, whether costs are thousands or
