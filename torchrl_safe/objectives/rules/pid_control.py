@@ -24,8 +24,9 @@ class PIDControl(MultiplierUpdater):
     .. math::
         I &\leftarrow \max(I + k_i (J - d),\ 0) \\
         u &\leftarrow I + k_p (\bar J - d) + k_d (\bar J - \bar J_\mathrm{previous})_+ \\
-        \lambda &\leftarrow \mathrm{clip}(u \text{ if } u \le 1 \text{ else } e^{u - 1},\
-            0,\ \mathrm{max})
+        \lambda &\leftarrow \mathrm{clip}(f(u),\ 0,\ \mathrm{max})
+
+    where :math:`f(u) = u` up to 1 and :math:`e^{u - 1}` above.
 
     **Above 1 the multiplier moves by factors.** The losses weigh the reward by
     :math:`1 / (1 + \lambda)`, so from 5 to 6 changes much less than from 0 to 1. Far above the
