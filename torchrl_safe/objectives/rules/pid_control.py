@@ -136,7 +136,7 @@ class PIDControl(MultiplierUpdater):
             raise ValueError(f"smoothing must be at least 0 and less than 1, got {smoothing!r}.")
         self.smoothing = as_number(smoothing)
         multiplier = loss_module.lagrange_multiplier
-        self.integral = self._parameter(multiplier)
+        self.integral = self._parameter(multiplier).clone()
         # NaN until there has been a batch.
         self.smoothed_cost = torch.full_like(multiplier, float("nan"))
         self.last_multiplier = multiplier.clone()
@@ -165,12 +165,13 @@ class PIDControl(MultiplierUpdater):
         return proposal
 
     def _parameter(self, multiplier: Tensor) -> Tensor:
-        """What the terms add up to, for a multiplier."""
+        """The sum of the terms that gives a multiplier."""
         if not self.normalize:
-            return multiplier.clone()
+            return multiplier
         return torch.where(multiplier > 1, 1 + multiplier.log(), multiplier)
 
     def _multiplier(self, parameter: Tensor) -> Tensor:
+        """The multiplier that a sum of the terms gives."""
         if not self.normalize:
             return parameter
         # Without a bound it must not overflow.
