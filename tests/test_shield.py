@@ -86,6 +86,22 @@ def test_projections_are_the_nearest_points(seed):
             np.testing.assert_allclose(points[index], expected, atol=1e-7)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_projections_also_count_how_an_image_changes(seed):
+    """In the coordinates of the symmetric square root the distance is the Euclidean one."""
+    image = np.random.default_rng(seed).normal(size=(40, 2, 3))
+    points, solved = project(*problems(seed), image)
+    np.testing.assert_array_equal(solved, project(*problems(seed))[1])
+    for index in np.flatnonzero(solved):
+        wanted, rows, least, lower, upper = (part[index] for part in problems(seed))
+        values, vectors = np.linalg.eigh(np.eye(3) + image[index].T @ image[index])
+        root = vectors * np.sqrt(values) @ vectors.T
+        all_rows = np.concatenate([rows, np.eye(3), -np.eye(3)]) @ np.linalg.inv(root)
+        bounds = np.concatenate([least, lower, -upper])
+        expected = brute_force(root @ wanted, all_rows, bounds)
+        np.testing.assert_allclose(root @ points[index], expected, atol=1e-7)
+
+
 def nearly_dependent(seed, count=200, apart=1e-5):
     """Half of the rows are all but combinations of the others."""
     rng = np.random.default_rng(seed)
@@ -265,6 +281,26 @@ def test_what_leads_away_is_left_alone(make_env, engine, turntable):
     state = turn(make_env, turntable, (0.45, 0.25, 0.5), action=-1.0).arm_state
     assert state.shield_correction[0] == 0
     assert state.joint_position[0, 0] == pytest.approx(-0.1, rel=0.05)
+
+
+def test_the_tool_goes_on_where_other_joints_can_give_way(make_env, engine):
+    env = make_env(ArmEnv, num_envs=16, obstacles=Scattered(), shield=Shield(), seed=0)
+    env.reset()
+    state, simulator = env.arm_state, env._simulator
+    action = np.sign(state.obstacle_position[:, 0] - state.ee_position)
+    asked, fingers = CartesianDelta().targets(action, state, simulator)
+    speeds = {"longest": simulator.joint_speed / env.control_rate, "duration": 1 / env.control_rate}
+    missed, turned = [], []
+    for tool_weight in (0.0, 10.0):
+        shield = Shield(tool_weight=tool_weight)
+        done = shield(asked, fingers, state, simulator, **speeds)
+        assert not done.braked.any()
+        change = done.joints - asked
+        tool = simulator.jacobian(state.joint_position)[:, :3] @ change[:, :, None]
+        missed.append(np.linalg.norm(tool[:, :, 0], axis=1))
+        turned.append(np.linalg.norm(change, axis=1))
+    assert (missed[1] < missed[0]).all()
+    assert (turned[1] > turned[0]).all()
 
 
 def test_far_from_everything_a_shield_does_nothing(make_env, engine, turntable):
@@ -539,6 +575,7 @@ def test_a_correction_needs_a_shield():
         {"rate": 0.0},
         {"reach": 0.01},
         {"acceleration": -1.0},
+        {"tool_weight": -1.0},
         {"obstacle_speed": -1.0},
     ],
     ids=lambda settings: next(iter(settings)),

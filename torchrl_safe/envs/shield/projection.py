@@ -22,12 +22,18 @@ _ROUNDING = 1e-6
 
 
 def project(
-    wanted: Array, rows: Array, least: Array, lower: Array, upper: Array
+    wanted: Array,
+    rows: Array,
+    least: Array,
+    lower: Array,
+    upper: Array,
+    image: Array | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
     r"""Returns the points nearest to ``wanted`` at which linear inequalities hold.
 
     .. math::
-        \min_x \tfrac12 |x - w|^2 \quad \text{such that} \quad A x \ge b, \quad l \le x \le u
+        \min_x \tfrac12 |x - w|^2 + \tfrac12 |K (x - w)|^2
+        \quad \text{such that} \quad A x \ge b, \quad l \le x \le u
 
     Solved exactly, by the dual active-set method of Goldfarb and Idnani (1983, Mathematical
     Programming 27). It begins with the bounds, which need no search. Then, as long as an inequality
@@ -42,6 +48,7 @@ def project(
         least: b, ``(N, r)``; -inf for rows that do not count.
         lower: l, ``(N, n)``; may be infinite.
         upper: u, ``(N, n)``, not less than l; may be infinite.
+        image: K, ``(N, m, n)``; without it, only :math:`|x - w|` counts.
 
     Returns:
         The points, ``(N, n)``, and which problems have a solution, ``(N,)``. Where there is
@@ -54,26 +61,40 @@ def project(
     """
     point = np.clip(wanted, lower, upper)
     solved = np.asarray(((rows @ point[:, :, None])[:, :, 0] >= least - _TOLERANCE).all(axis=1))
+    if image is not None:  # The nearest of a box is then another point.
+        solved &= (point == wanted).all(axis=1)
     open_ = np.flatnonzero(~solved)
-    if len(open_):
-        bounds = lower[open_], upper[open_]
-        point[open_], solved[open_] = _active_set(
-            wanted[open_], point[open_], *_unit(rows[open_], least[open_], *bounds)
-        )
+    if not len(open_):
+        return point, solved
+    rows, least = _with_bounds(rows[open_], least[open_], lower[open_], upper[open_])
+    if image is None:
+        point[open_], solved[open_] = _active_set(wanted[open_], point[open_], *_unit(rows, least))
+        return point, solved
+    # With L L^T = 1 + K^T K, the distance between y = L^T x is the one that counts.
+    some = image[open_]
+    root = np.linalg.cholesky(np.eye(wanted.shape[1]) + some.transpose(0, 2, 1) @ some)
+    back = np.linalg.inv(root).transpose(0, 2, 1)
+    target = (root.transpose(0, 2, 1) @ wanted[open_, :, None])[:, :, 0]
+    found, solved[open_] = _active_set(target, target, *_unit(rows @ back, least))
+    point[open_] = (back @ found[:, :, None])[:, :, 0]
     return point, solved
 
 
-def _unit(rows: Array, least: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """All inequalities, the bounds at the end, with rows of unit length; or of none."""
+def _with_bounds(rows: Array, least: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """All inequalities, the bounds at the end."""
+    count, given, width = rows.shape
+    every = np.empty((count, given + 2 * width, width))
+    every[:, :given], every[:, given:] = rows, np.concatenate([np.eye(width), -np.eye(width)])
+    return every, np.concatenate([least, lower, -upper], axis=1)
+
+
+def _unit(rows: Array, least: Array) -> tuple[Array, Array]:
+    """Inequalities with rows of unit length; or of none."""
     lengths = np.sqrt((rows * rows).sum(axis=2))
     # What does not depend on x always holds, or never: it is then a row that nothing satisfies.
     flat = lengths <= _PARALLEL
     scale = 1 / np.where(flat, 1.0, lengths)
-    count, given, width = rows.shape
-    each = np.empty((count, given + 2 * width, width))
-    each[:, :given] = np.where(flat[..., None], 0.0, rows * scale[..., None])
-    each[:, given:] = np.concatenate([np.eye(width), -np.eye(width)])
-    return each, np.concatenate([least * scale, lower, -upper], axis=1)
+    return np.where(flat[..., None], 0.0, rows * scale[..., None]), least * scale
 
 
 def _active_set(

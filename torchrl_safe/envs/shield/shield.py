@@ -79,12 +79,14 @@ class Shield:
     are nearest to those asked for, :math:`q + w`:
 
     .. math::
-        \min_x |x - w|^2 \quad\text{such that}\quad
+        \min_x |x - w|^2 + \kappa^2 |J (x - w)|^2 \quad\text{such that}\quad
         \nabla d_i^\top x - c_i \ge -s(r_i) \quad\text{for all } i, \qquad l \le x \le u
 
-    T is the duration of the control step, c how far the obstacle comes nearer in it, and s a
-    control barrier function in discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and
-    Sreenath 2017, RSS), with which the arm can always stop:
+    J is the Jacobian of the tool point and :math:`\kappa` is ``tool_weight``. Joints that can give
+    way without moving the tool do so: a hand turns to pass an obstacle. T is the duration of the
+    control step, c how far the obstacle comes nearer in it, and s a control barrier function in
+    discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and Sreenath 2017, RSS), with which
+    the arm can always stop:
 
     .. math::
         s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\ \sqrt{b^2 / 4 + 2 b r} - b / 2\right),
@@ -144,6 +146,8 @@ class Shield:
         workspace: if given, the tool point stays in this box, the margin away from its walls. If
             it begins outside, it moves in. Where there is no solution, a fast tool may leave it by
             a centimetre while the arm brakes.
+        tool_weight: how much a metre of the tool point's way counts against a radian of a joint's,
+            rad/m. With 0, only joints count.
 
     Raises:
         TypeError: if ``workspace`` is not a Region.
@@ -166,9 +170,10 @@ class Shield:
     acceleration: float = 10.0
     obstacle_speed: float | None = None
     workspace: Region | None = None
+    tool_weight: float = 10.0
 
     def __post_init__(self) -> None:
-        check_not_negative(margin=self.margin, table=self.table)
+        check_not_negative(margin=self.margin, table=self.table, tool_weight=self.tool_weight)
         check_positive(rate=self.rate, reach=self.reach, acceleration=self.acceleration)
         if self.reach <= max(self.margin, self.table):
             raise ValueError(
@@ -220,7 +225,9 @@ class Shield:
         # If nothing leaves enough room to stop, take what stops above the margin.
         last = np.minimum(least, now.closing - now.room)
         comes = now.closing > 0
-        change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper)
+        tool = self.tool_weight * simulator.jacobian(angles)[:, :3]
+        tool[pressed] = 0  # The shortest way out.
+        change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper, tool)
         # Measure the end of the step as well where it could be too near.
         left = near.room - near.closing + (near.joints @ change[:, :, None])[:, :, 0]
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
@@ -245,6 +252,7 @@ class Shield:
                 np.concatenate([comes[again], then.closing[short] > 0], axis=1),
                 lower[again],
                 upper[again],
+                tool[again],
             )
         still, braked = ~solved[:, None], braked | pressed
         if fingers.shape[1]:
@@ -399,6 +407,7 @@ def _solve(
     comes: NDArray[np.bool_],
     lower: Array,
     upper: Array,
+    tool: Array,
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Projects; where there is no solution, to a stand, with ``last`` in place of ``least``.
 
@@ -408,7 +417,7 @@ def _solve(
     Returns:
         The solutions, where there is one, and which are not of what was asked for.
     """
-    change, solved = project(asked, rows, least, lower, upper)
+    change, solved = project(asked, rows, least, lower, upper, tool)
     braked = ~solved
     some = np.flatnonzero(braked)
     if len(some):
