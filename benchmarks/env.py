@@ -151,17 +151,26 @@ def what_a_shield_costs(quick: bool) -> Iterator[Figure]:
             physics=physics,
             max_episode_steps=ENDLESS,
         )
-        with closing(make()) as plain, closing(make(shield=Shield())) as shielded:
+        with (
+            closing(make()) as plain,
+            closing(make(shield=Shield())) as shielded,
+            closing(make(shield=Shield(tool_weight=10.0))) as weighted,
+        ):
             times = race(
-                {"plain": rollout(plain, steps), "shield": rollout(shielded, steps)},
+                {
+                    "none": rollout(plain, steps),
+                    "Shield": rollout(shielded, steps),
+                    "Shield(tool_weight=10)": rollout(weighted, steps),
+                },
                 rounds=rounds,
             )
-        yield ratio(
-            f"{name}, substeps 12, {worlds} worlds, {engine}: Shield / none (time)",
-            times["shield"],
-            times["plain"],
-            at_most=1.5,
-        )
+        for shield in ("Shield", "Shield(tool_weight=10)"):
+            yield ratio(
+                f"{name}, substeps 12, {worlds} worlds, {engine}: {shield} / none (time)",
+                times[shield],
+                times["none"],
+                at_most=1.5,
+            )
 
 
 def against_panda_gym(quick: bool) -> Iterator[Figure]:

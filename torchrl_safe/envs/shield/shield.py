@@ -82,11 +82,11 @@ class Shield:
         \min_x |x - w|^2 + \kappa^2 |J (x - w)|^2 \quad\text{such that}\quad
         \nabla d_i^\top x - c_i \ge -s(r_i) \quad\text{for all } i, \qquad l \le x \le u
 
-    J is the Jacobian of the tool point and :math:`\kappa` is ``tool_weight``. Joints that can give
-    way without moving the tool do so: a hand turns to pass an obstacle. T is the duration of the
-    control step, c how far the obstacle comes nearer in it, and s a control barrier function in
-    discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and Sreenath 2017, RSS), with which
-    the arm can always stop:
+    J is the Jacobian of the tool point and :math:`\kappa` is ``tool_weight``. If it is not 0, the
+    joints that can give way without moving the tool do so: a hand turns to pass an obstacle. T is
+    the duration of the control step, c how far the obstacle comes nearer in it, and s a control
+    barrier function in discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and Sreenath
+    2017, RSS), with which the arm can always stop:
 
     .. math::
         s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\ \sqrt{b^2 / 4 + 2 b r} - b / 2\right),
@@ -170,7 +170,7 @@ class Shield:
     acceleration: float = 10.0
     obstacle_speed: float | None = None
     workspace: Region | None = None
-    tool_weight: float = 10.0
+    tool_weight: float = 0.0
 
     def __post_init__(self) -> None:
         check_not_negative(margin=self.margin, table=self.table, tool_weight=self.tool_weight)
@@ -225,8 +225,10 @@ class Shield:
         # If nothing leaves enough room to stop, take what stops above the margin.
         last = np.minimum(least, now.closing - now.room)
         comes = now.closing > 0
-        tool = self.tool_weight * simulator.jacobian(angles)[:, :3]
-        tool[pressed] = 0  # The shortest way out.
+        tool = None
+        if self.tool_weight:
+            tool = self.tool_weight * simulator.jacobian(angles)[:, :3]
+            tool[pressed] = 0  # The shortest way out.
         change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper, tool)
         # Measure the end of the step as well where it could be too near.
         left = near.room - near.closing + (near.joints @ change[:, :, None])[:, :, 0]
@@ -252,7 +254,7 @@ class Shield:
                 np.concatenate([comes[again], then.closing[short] > 0], axis=1),
                 lower[again],
                 upper[again],
-                tool[again],
+                None if tool is None else tool[again],
             )
         still, braked = ~solved[:, None], braked | pressed
         if fingers.shape[1]:
@@ -407,7 +409,7 @@ def _solve(
     comes: NDArray[np.bool_],
     lower: Array,
     upper: Array,
-    tool: Array,
+    tool: Array | None,
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Projects; where there is no solution, to a stand, with ``last`` in place of ``least``.
 
