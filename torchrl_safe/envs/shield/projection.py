@@ -66,15 +66,17 @@ def project(
     open_ = np.flatnonzero(~solved)
     if not len(open_):
         return point, solved
-    rows, least = _with_bounds(rows[open_], least[open_], lower[open_], upper[open_])
+    rows, least, bounds = rows[open_], least[open_], (lower[open_], upper[open_])
     if image is None:
-        point[open_], solved[open_] = _active_set(wanted[open_], point[open_], *_unit(rows, least))
+        rows, least = _with_bounds(*_unit(rows, least), *bounds)
+        point[open_], solved[open_] = _active_set(wanted[open_], point[open_], rows, least)
         return point, solved
     # With L L^T = 1 + K^T K, the distance between y = L^T x is the one that counts.
     some = image[open_]
     root = np.linalg.cholesky(np.eye(wanted.shape[1]) + some.transpose(0, 2, 1) @ some)
     back = np.linalg.inv(root).transpose(0, 2, 1)
     target = (root.transpose(0, 2, 1) @ wanted[open_, :, None])[:, :, 0]
+    rows, least = _with_bounds(rows, least, *bounds)
     found, solved[open_] = _active_set(target, target, *_unit(rows @ back, least))
     point[open_] = (back @ found[:, :, None])[:, :, 0]
     return point, solved
