@@ -16,7 +16,7 @@ NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrai
 	pid_control ppo_cases ppo_lagrangian ppo_lagrangian_interface sac_lagrangian scaling trust_region trust_region_loss trust_region_optimum \
 	trust_region_refusals trust_region_step violation))
 
-.PHONY: train test test-kernels test-slow test-wheel test-safety-gymnasium safe-gym safe-gym-grid \
+.PHONY: train test test-integration test-kernels test-slow test-wheel test-safety-gymnasium safe-gym safe-gym-grid \
 	bench-omnisafe compare suite paper sweep profile gallery bench draws attack ray docs lint format type clean
 
 train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
@@ -26,8 +26,11 @@ train: $(READY)  ## the main job; options go in ARGS="--seed 1 --action joint"
 # Files keep their order: xdist would begin those with few tests last, some of which are long.
 PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 
-test: $(VENV)/.bullet-safety-gym  ## everything but the slow tests, on two cores
-	OMP_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL) -m "not slow" $(ARGS)
+test: $(VENV)/.bullet-safety-gym  ## the parts, on two cores; CI also runs test-integration
+	OMP_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL) -m "not integration and not slow" $(ARGS)
+
+test-integration: $(VENV)/.bullet-safety-gym  ## scripts, pages and trainings from beginning to end
+	OMP_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL) -m "integration and not slow" $(ARGS)
 
 # The kernels that every processor has, in place of those that it is best at.
 test-kernels: $(READY)  ## the numerical tests once more, as another processor rounds

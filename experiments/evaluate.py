@@ -132,9 +132,9 @@ def cost_limits(config: Config, saved: Policy) -> tuple[float, ...]:
     if "cost_keys" in settings:  # Of safe_gym: one limit may be for all.
         limits = settings["cost_limit"]
         return tuple(limits * len(settings["cost_keys"]) if len(limits) == 1 else limits)
-    if {"cost_limit", "suite_task"} & settings.keys():  # Of make train.
+    if "name" in settings:  # Of make train.
         return tuple(training_config(saved).cost_limits.values())
-    return tuple(saved.settings.get("cost_limits", ()))
+    return tuple(settings.get("cost_limits", ()))
 
 
 def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:

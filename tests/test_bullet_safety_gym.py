@@ -20,7 +20,10 @@ pytest.importorskip(
 )
 
 # It bounds observations by the largest number of double precision, and says that they are float32.
-pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in cast:RuntimeWarning")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.filterwarnings("ignore:overflow encountered in cast:RuntimeWarning"),
+]
 
 # Each task and each agent.
 NAMES = [

@@ -29,6 +29,8 @@ from torchrl_safe.envs import (
     Workspace,
 )
 
+pytestmark = pytest.mark.integration
+
 ACTIONS = {"cartesian": CartesianDelta, "joint": JointDelta}
 TASKS = {"reach": Reach(), "push": Push(), "pick": PickAndPlace()}
 OBSTACLES = {

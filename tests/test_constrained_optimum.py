@@ -28,6 +28,8 @@ import pytest
 from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss
 from torchrl_safe.testing import ConstrainedBandit, train_on_bandit
 
+pytestmark = pytest.mark.integration
+
 LIMIT = ConstrainedBandit.optimal_probability
 
 # In the unit of the cost.

@@ -19,6 +19,8 @@ from experiments.demonstrations import (
 from experiments.learners import OnPolicyLearner
 from experiments.train import make_env, train, train_and_evaluate
 
+pytestmark = pytest.mark.integration
+
 SMALL = {
     "task": "push",
     "obstacles": "none",

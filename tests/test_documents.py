@@ -13,6 +13,8 @@ from tensordict import TensorDict
 
 from torchrl_safe.envs import ArmEnv, MuJoCo, NoObstacles
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).parent.parent
 
 

@@ -28,6 +28,8 @@ from torchrl_safe.objectives import (
 )
 from torchrl_safe.testing import ConstrainedBandit, run_epochs, train_on_bandit
 
+pytestmark = pytest.mark.integration
+
 LIMIT = ConstrainedBandit.optimal_probability
 
 # A_r - lambda A_c vanishes here at p = LIMIT.

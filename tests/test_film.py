@@ -25,7 +25,7 @@ from torchrl_safe.envs import (
 )
 from torchrl_safe.envs.physics.palette import GOAL, OBSTACLE, TOUCHED
 
-pytestmark = pytest.mark.usefixtures("engine")
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("engine")]
 
 
 def forwards(observation):

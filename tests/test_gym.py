@@ -336,6 +336,7 @@ def test_the_info_tells_what_the_shield_has_done(turntable):
     assert infos[1]["shield_correction"] == pytest.approx(0.1)
 
 
+@pytest.mark.integration
 def test_stable_baselines_learns_on_it():
     """Policy and value change, episodes are as long as the arm's time limit allows."""
     env = Monitor(gymnasium.make(NAME), info_keywords=("is_success",))

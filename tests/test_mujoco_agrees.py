@@ -32,6 +32,8 @@ from torchrl_safe.envs import (
     Sphere,
 )
 
+pytestmark = pytest.mark.integration
+
 ENGINES = (Bullet(), ONE)
 LAYOUTS = {
     "in front": InFront(),

@@ -35,6 +35,8 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_safe.objectives import DualAscent, SACLagrangianLoss, TD3LagrangianLoss
 
+pytestmark = pytest.mark.integration
+
 with warnings.catch_warnings():  # TorchRL 0.14 deprecates a base class that it still derives from.
     warnings.filterwarnings("ignore", "Creating .* WeightUpdaterBase", DeprecationWarning)
     from torchrl.collectors import Collector

@@ -26,6 +26,8 @@ from torchrl_safe.envs import (
     paper_env,
 )
 
+pytestmark = pytest.mark.integration
+
 
 def still(env):
     """AR1's zero action: no displacement, fingers wherever they are let go."""

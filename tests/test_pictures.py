@@ -10,7 +10,7 @@ from torchrl.record.loggers import CSVLogger
 from experiments.gallery import Config, main
 from torchrl_safe.envs import ArmEnv, Human
 
-pytestmark = pytest.mark.usefixtures("engine")
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("engine")]
 
 
 def test_torchrl_films(make_env, tmp_path):

@@ -27,6 +27,8 @@ from torchrl_safe.envs import (
     Scattered,
 )
 
+pytestmark = pytest.mark.integration
+
 TASKS = {"reach": (Reach(), 60), "push": (Push(), 200), "pick": (PickAndPlace(), 100)}
 
 

@@ -544,6 +544,7 @@ def test_version_and_missing_file(trained, tmp_path):
 # ---------------------------------------------------------------- python -m experiments.evaluate
 
 
+@pytest.mark.integration
 def test_evaluation_in_the_environment_of_the_training(trained, tmp_path, capsys):
     _, file = trained
     out, video = tmp_path / "out", tmp_path / "film.webp"
@@ -596,7 +597,8 @@ def test_evaluation_in_an_environment_of_ones_own(mine, trained, tmp_path, capsy
 
 def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):
     actor = TensorDictModule(MLP(3, 1), ["observation"], ["action"])
-    save_policy(tmp_path / "policy.pt", actor, Unbounded(3))
+    # What a loop of one's own may note: a number of another program's.
+    save_policy(tmp_path / "policy.pt", actor, Unbounded(3), settings={"cost_limit": 0.5})
     settings = {"env": "mine:pendulum", "episodes": 2, "cost_limits": (0.0, 2.0, 3.0)}
     evaluate.main(evaluate.Config(tmp_path / "policy.pt", max_steps=5, **settings))
     with pytest.raises(

@@ -18,6 +18,8 @@ from experiments.algorithms import ALGORITHMS
 from experiments.config import Config
 from experiments.train import main, train
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).parent.parent
 SETTINGS = {
     "frames": 640,

@@ -36,7 +36,7 @@ SMALL = Config(
 )
 
 
-pytestmark = pytest.mark.usefixtures("threads")
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("threads")]
 
 
 def weights(agent):

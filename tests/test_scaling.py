@@ -27,6 +27,8 @@ from torchrl_safe.objectives import (
 )
 from torchrl_safe.testing import make_batch, make_networks
 
+pytestmark = pytest.mark.integration
+
 # ---------------------------------------------------------------- the scale
 
 

@@ -40,7 +40,7 @@ from torchrl_safe.envs import (
     Scattered,
 )
 
-pytestmark = pytest.mark.usefixtures("engine")
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("engine")]
 
 PILOTS = {
     "reach": (over, straight),

@@ -19,6 +19,8 @@ from torchrl_safe import policy
 from torchrl_safe.envs import SUITE
 from torchrl_safe.policy import load_policy, save_policy, shipped_policies
 
+pytestmark = pytest.mark.integration
+
 FOLDER = Path(torchrl_safe.__file__).parent / "policies"
 CARDS = shipped_policies()
 NAME = "panda-reach-human"

@@ -18,6 +18,8 @@ from torchrl.objectives import LossModule
 from torchrl_safe.envs import ArmEnv, Collision, InFront, Moving, Proximity
 from torchrl_safe.objectives import DualAscent, PIDControl
 
+pytestmark = pytest.mark.integration
+
 LOG = logging.getLogger(__name__)
 PROC = Path("/proc/self")
 needs_proc = pytest.mark.skipif(not PROC.exists(), reason="reads /proc")

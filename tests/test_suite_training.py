@@ -26,6 +26,8 @@ from experiments.suite_report import (
 from torchrl_safe.envs import SUITE, Human, SpeedAndSeparation
 from torchrl_safe.policy import load_policy
 
+pytestmark = pytest.mark.integration
+
 NAME = "panda-reach-human"
 TINY = {
     "frames": 256,

@@ -26,6 +26,8 @@ from experiments.train import collecting, main, make_env, start, train
 from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
 
+pytestmark = pytest.mark.integration
+
 KINDS = {"cpo", "cup", "ppo-saute", "td3-lagrangian"}
 
 

@@ -39,6 +39,8 @@ from torchrl_safe.envs import (
 )
 from torchrl_safe.policy import save_policy
 
+pytestmark = pytest.mark.integration
+
 NAME = "panda-reach-human"
 LIMIT = SUITE[NAME].cost_limits["separation"]
 FAST = MuJoCo(threads=1)

@@ -114,11 +114,11 @@ for batch in Collector(
 #
 # ``save_policy`` records the computation of the mean action, not your Python classes. Here the
 # standardization of the observation is the first layer of the actor, so it is in the file as
-# well. If yours is a transform of the environment, save ``TensorDictSequential(transform,
-# actor)``.
+# well. If yours is a transform of the environment, save
+# ``TensorDictSequential(transform.clone(), actor)``.
 
 path = Path(tempfile.mkdtemp(), "policy.pt")
-save_policy(path, actor, arm.observation_spec_unbatched, settings={"cost_limit": 0.5})
+save_policy(path, actor, arm.observation_spec_unbatched, settings={"cost_limits": [0.5]})
 print(path.name, f"{path.stat().st_size / 1000:.0f} kB")
 
 # %%
@@ -255,8 +255,9 @@ for name, episodes in played.items():
 #
 # - Put limits on what the second cost shows: `several costs, several limits
 #   <several_limits.html>`_.
-# - ``python -m experiments.evaluate --policy policy.pt --video film.gif`` does all this for a
-#   file.
+# - ``python -m experiments.evaluate --policy policy.pt --env mine:make_env --video film.gif``
+#   evaluates and films a file. ``mine.py`` has a function ``make_env(num_envs)`` that returns your
+#   environment. For a policy of ``make train``, ``--policy`` is enough.
 # - What can be saved, what a file guarantees: `Deploy a policy <../howto/deploy.html>`_.
 # - Reference: `policies <../reference/policy.html>`_, `metrics <../reference/metrics.html>`_,
 #   `Gymnasium <../reference/gym.html>`_.
