@@ -80,7 +80,8 @@ def record(part: str, figures: Sequence[Figure], out: Path) -> None:
         ],
     }
     write_whole(file, json.dumps(results, indent=1))
-    (out / "table.md").write_text("\n\n".join(_section(*item) for item in results.items()) + "\n")
+    text = "\n\n".join(_section(*item) for item in results.items()) + "\n"
+    write_whole(out / "table.md", text)
 
 
 def machine() -> dict[str, Any]:

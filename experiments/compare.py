@@ -8,7 +8,6 @@ runs what is missing.
 from __future__ import annotations
 
 import dataclasses
-import os
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from experiments.config import SHIELDED, Action, AlgorithmName, Config as TrainC
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
 from experiments.style import LIGHT, colour, cost_axis, figure_style, label, limit_line
+from torchrl_safe._cores import cores
 from torchrl_safe.metrics import worst_seed
 
 #: Limits of what keeps to a budget in every episode: with a limit below one touch the first touch
@@ -50,7 +50,7 @@ class Config:
     """Control steps to train for."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
-    jobs: int = os.cpu_count() or 1
+    jobs: int = cores()
     """Runs side by side."""
     out: Path = Path("runs/compare")
     """Folder of results; runs that are already there are not run again."""

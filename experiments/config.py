@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from time import strftime
@@ -14,6 +13,7 @@ from typing import Any, Literal
 import tyro
 
 from experiments.options import check_once, short_help
+from torchrl_safe._cores import cores
 from torchrl_safe.envs import SUITE, PickAndPlace, Push, Reach
 
 Action = Literal["cartesian", "joint"]
@@ -296,7 +296,7 @@ class Config:
         """Algorithms that train at a time: what ``jobs`` says, or what is fastest."""
         if self.jobs is not None:
             return self.jobs
-        return 1 if self.physics == "bullet" else os.cpu_count() or 1
+        return 1 if self.physics == "bullet" else cores()
 
 
 # Four times as many episodes in a batch: a mean of more of them tells a rare cost from none.

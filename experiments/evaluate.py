@@ -26,9 +26,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from experiments import train
 from experiments.agent import num_costs
 from experiments.config import Config as TrainConfig, Engine
+from experiments.files import write_whole
 from experiments.film import save_film
 from experiments.report import figures_table
 from torchrl_safe.envs import ArmEnv
+from torchrl_safe.envs.gym import SafeGymEnv, SafeGymWrapper
 from torchrl_safe.evaluation import evaluate, summarize
 from torchrl_safe.metrics import conditional_value_at_risk, violation_rate
 from torchrl_safe.policy import Policy, load_policy
@@ -160,13 +162,20 @@ def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
 
 
 def cost_names(env: EnvBase) -> tuple[str, ...]:
-    """Names of the costs; an environment that is no arm has their numbers."""
-    return env.cost_names if is_arm(env) else tuple(map(str, range(num_costs(env))))
+    """Names of the costs; an environment that is not ours has their numbers."""
+    base = base_env(env)
+    named = isinstance(base, ArmEnv | SafeGymEnv | SafeGymWrapper)
+    return base.cost_names if named else tuple(map(str, range(num_costs(env))))
 
 
 def is_arm(env: EnvBase) -> bool:
     """Tells whether it is an arm that the environment moves."""
-    return isinstance(env.base_env if isinstance(env, TransformedEnv) else env, ArmEnv)
+    return isinstance(base_env(env), ArmEnv)
+
+
+def base_env(env: EnvBase) -> EnvBase:
+    """The environment without its transforms."""
+    return env.base_env if isinstance(env, TransformedEnv) else env
 
 
 def play(
@@ -224,9 +233,9 @@ def main(config: Config) -> None:
     print(text)
     if config.out is not None:
         config.out.mkdir(parents=True, exist_ok=True)
-        (config.out / "table.md").write_text(text)
+        write_whole(config.out / "table.md", text)
         results = {"policy": str(config.policy), "cost_limits": limits, "evaluation": figures}
-        (config.out / "results.json").write_text(json.dumps(results, indent=1))
+        write_whole(config.out / "results.json", json.dumps(results, indent=1))
     if config.video is not None:
         stage = make_env(num_envs=1)
         save_film(

@@ -14,6 +14,7 @@ import tyro
 
 from experiments import train
 from experiments.config import AlgorithmName, Config as TrainConfig
+from torchrl_safe._checks import check_count
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Config:
     def __post_init__(self) -> None:
         if self.out.suffix not in (".gif", ".webp"):
             raise ValueError(f"out must end in .gif or .webp, got {str(self.out)!r}.")
+        check_count(episodes=self.episodes, width=self.width)
 
 
 def main(config: Config) -> None:

@@ -133,7 +133,7 @@ def save_results(out: Path, config: Any, runs: Sequence[dict[str, Any]], table: 
         "runs": runs,
     }
     write_whole(out / "results.json", json.dumps(results, default=str))
-    (out / "table.md").write_text(table)
+    write_whole(out / "table.md", table)
     print(f"\n{table}\nResults are in {out}.")
 
 

@@ -163,10 +163,10 @@ class OnPolicyLearner:
         for prepare, objective in self.phases:
             if prepare is not None:
                 prepare()
-            moved = moved_from_here(self.actor, data)
+            moved = moved_from_here(self.actor, data) if self.max_kl < math.inf else None
             for minibatch in self._minibatches(data):
                 _descend(objective(minibatch), self.optimizer, self.policy)
-                if self.max_kl < math.inf and moved() > self.max_kl:
+                if moved is not None and moved() > self.max_kl:
                     break
         self.schedule.step()
         self.noise.step()

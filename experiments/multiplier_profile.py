@@ -8,7 +8,6 @@ it, repeat the command: it runs what is missing.
 from __future__ import annotations
 
 import dataclasses
-import os
 from itertools import cycle, product
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from experiments import train
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, MultiplierRule
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.style import GREY, colour, cost_axis, figure_style, limit_line
+from torchrl_safe._cores import cores
 
 RULES: dict[MultiplierRule, str] = {"dual-ascent": "DualAscent", "pid": "PIDControl"}
 
@@ -44,7 +44,7 @@ class Config:
     """Control steps to train for."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
-    jobs: int = os.cpu_count() or 1
+    jobs: int = cores()
     """Runs side by side."""
     out: Path = Path("runs/profile")
     """Folder of results; runs that are already there are not run again."""

@@ -8,7 +8,6 @@ To resume it, repeat the command: it runs what is missing.
 from __future__ import annotations
 
 import dataclasses
-import os
 from itertools import product
 from pathlib import Path
 from time import perf_counter
@@ -27,6 +26,8 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOpe
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import LEARNING, Line, mean_of_known, plot_learning
 from experiments.style import colour
+from torchrl_safe._checks import check_count, check_not_negative
+from torchrl_safe._cores import cores
 from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ActionMode, paper_env
 from torchrl_safe.evaluation import evaluate
 from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss
@@ -66,7 +67,7 @@ class Config:
     """Batches of 1000 control steps."""
     cost_limit: float = 25.0
     """Limit of the expected cost of an episode, in control steps with a contact."""
-    jobs: int = os.cpu_count() or 1
+    jobs: int = cores()
     """Runs side by side."""
     eval_episodes: int = 100
     """Episodes of the final evaluation of each run, with the deterministic policy."""
@@ -75,6 +76,8 @@ class Config:
 
     def __post_init__(self) -> None:
         check_grid(self, "seeds")
+        check_count(epochs=self.epochs, eval_episodes=self.eval_episodes)
+        check_not_negative(cost_limit=self.cost_limit)
 
 
 def make_env(action: str, num_envs: int, seed: int) -> EnvBase:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from itertools import product
@@ -22,6 +21,7 @@ import tyro
 from experiments import safe_gym
 from experiments.files import write_whole
 from experiments.grid import check_grid, run_grid
+from torchrl_safe._cores import cores
 
 Library = Literal["ours", "omnisafe"]
 
@@ -40,7 +40,7 @@ class Config:
     """Steps to train for; whole epochs of OmniSafe, 20,000 steps each."""
     cost_limit: float = 25.0
     """Limit of the expected cost of an episode."""
-    jobs: int = os.cpu_count() or 1
+    jobs: int = cores()
     """Runs side by side."""
     out: Path = Path("runs/safe-gym")
     """Folder of results; runs that are already there are not run again."""

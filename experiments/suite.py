@@ -7,7 +7,6 @@ the command: it runs what is missing.
 from __future__ import annotations
 
 import dataclasses
-import os
 from itertools import product
 from pathlib import Path
 from typing import Any, get_args
@@ -26,6 +25,7 @@ from experiments.config import (
 from experiments.gallery import WITH_PERSON
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.suite_report import draw
+from torchrl_safe._cores import cores
 from torchrl_safe.envs import SUITE
 
 
@@ -45,7 +45,7 @@ class Config:
     """Control steps to train for; by default as many as each task has."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
-    jobs: int = os.cpu_count() or 1
+    jobs: int = cores()
     """Runs side by side."""
     out: Path = Path("runs/suite")
     """Folder of results; runs that are already there are not run again."""

@@ -147,20 +147,19 @@ def excess(evaluation: Mapping[str, Any], limits: Mapping[str, float]) -> float:
 
 
 def profile(
-    values: NDArray[np.float64], thresholds: NDArray[np.float64], *, seed: int = 0
+    values: NDArray[np.float64], thresholds: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The share of runs above each threshold, and its band: Agarwal et al. 2021, section 4.2.
 
     Args:
         values: scores of the runs, (tasks, seeds).
         thresholds: (t,).
-        seed: seed of the bootstrap, in which each task draws its own runs.
 
     Returns:
         The shares, (t,), and the ends of their pointwise 95 % intervals, (2, t).
     """
     tasks, seeds = values.shape
-    drawn = np.random.default_rng(seed).integers(seeds, size=(_DRAWS, tasks, seeds))
+    drawn = np.random.default_rng(0).integers(seeds, size=(_DRAWS, tasks, seeds))
     again = np.take_along_axis(values[None], drawn, axis=2).reshape(_DRAWS, -1)
     above = np.stack([(again > threshold).mean(1) for threshold in thresholds], axis=1)
     share = (values.reshape(1, -1) > thresholds[:, None]).mean(1)

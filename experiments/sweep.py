@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
@@ -32,6 +31,7 @@ from experiments.report import (
     successes,
 )
 from experiments.style import ALARM, INK, colour, cost_axis, figure_style, label, label_ends
+from torchrl_safe._cores import cores
 from torchrl_safe.metrics import mean, worst_seed
 
 
@@ -61,7 +61,7 @@ class Config:
     """Logarithm of the policy's standard deviation at the start."""
     eval_episodes: int = 256
     """Episodes of the final evaluation of each run, with the deterministic policy."""
-    jobs: int = os.cpu_count() or 1
+    jobs: int = cores()
     """Runs side by side."""
     out: Path = Path("runs/sweep")
     """Folder of results; runs that are already there are not run again."""

@@ -397,7 +397,7 @@ def main(config: Config) -> None:
     plot_curves(results, config.out / "curves.png")
     film(config, config.out / "film.gif", seed=config.seed, width=320)
     text = table(results)
-    (config.out / "table.md").write_text(text)
+    write_whole(config.out / "table.md", text)
     print(f"\n{text}\nResults are in {config.out}.")
 
 

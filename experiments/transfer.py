@@ -8,7 +8,6 @@ command.
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -26,6 +25,7 @@ from experiments.algorithms import ALGORITHMS, no_transforms
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import shown_cost
 from experiments.suite_report import excess
+from torchrl_safe._cores import cores
 from torchrl_safe.envs import (
     SUITE,
     ArmState,
@@ -82,7 +82,7 @@ class Config:
     """Episodes of each policy under each condition, the same for all."""
     seed: int = 3_000_000
     """Seed of the episodes; that of the cards."""
-    jobs: int = os.cpu_count() or 1
+    jobs: int = cores()
     """Evaluations side by side."""
     out: Path = Path("runs/transfer")
     """Folder of results; what is already there is not played again."""

@@ -336,7 +336,11 @@ def test_bad_arguments(make, message):
     [
         (
             lambda: CartesianDelta(inverse_kinematics=3),
-            "inverse_kinematics must be callable",
+            "inverse_kinematics must be a callable object, got 3",
+        ),
+        (
+            lambda: CartesianDelta(inverse_kinematics=DampedLeastSquares),
+            "inverse_kinematics must be a callable object, got <class",
         ),
         (lambda: Bullet(furniture=("plane.urdf",)), "furniture must be pairs of a file and a pos"),
         (lambda: Bullet(target_urdf=3), "target_urdf must be an instance of str, got 3"),

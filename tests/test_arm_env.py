@@ -542,6 +542,7 @@ def test_bad_arguments(arguments, message):
         ({"costs": [Collision()]}, "costs must be an instance of Mapping"),
         ({"costs": {"c": Collision}}, "cost 'c' must be a callable object, got <class"),
         ({"costs": {1: Collision()}}, r"costs must have names that are strings, got \[1\]"),
+        ({"gui": "no"}, "gui must be True or False, got 'no'"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )

@@ -569,6 +569,8 @@ def test_values_are_reduced_as_torchrl_does(shape, key, reduction):
     data["mine"] = torch.rand(4, 6, 1) > 0.3
     expected = loss._reduce_loss(values, data)
     assert torch.equal(reduced(loss, values, data), expected)
+    with pytest.raises(ValueError, match='reduction must be "mean", "sum" or "none", got'):
+        reduced(loss, values, data, reduction="Sum")
 
 
 # ---------------------------------------------------------------- what does not fit

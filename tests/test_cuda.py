@@ -26,6 +26,7 @@ from torchrl_safe.evaluation import evaluate
 from torchrl_safe.objectives import (
     CUPLoss,
     DualAscent,
+    MultiplierUpdater,
     PIDControl,
     PPOLagrangianLoss,
     SACLagrangianLoss,
@@ -114,6 +115,13 @@ def test_off_policy_losses(kind, monkeypatch):
         assert_on_gpu_as_on_cpu(gpu, cpu)
 
 
+class Exponentiated(MultiplierUpdater):
+    """As a user writes it, without a word about devices."""
+
+    def next_multiplier(self, multiplier, violation):
+        return multiplier.clamp_min(0.01) * (violation / self.cost_limit).exp()
+
+
 @pytest.mark.parametrize("costs_on", ["cpu", "cuda"])
 @pytest.mark.parametrize(
     "rule",
@@ -121,8 +129,9 @@ def test_off_policy_losses(kind, monkeypatch):
         partial(DualAscent, lr=0.1),
         partial(DualAscent, lr=0.1, optimizer=torch.optim.Adam),
         PIDControl,
+        Exponentiated,
     ],
-    ids=["sgd", "adam", "pid"],
+    ids=["sgd", "adam", "pid", "own"],
 )
 def test_multiplier_rules(rule, costs_on):
     both = on_both(PPOLagrangianLoss(*make_networks(COSTS), num_costs=COSTS))

@@ -5,7 +5,11 @@ import re
 import pytest
 import torch
 
-from torchrl_safe.objectives import penalized_advantage, scaled_advantages
+from torchrl_safe.objectives import (
+    cost_advantage_scale,
+    penalized_advantage,
+    scaled_advantages,
+)
 
 
 def test_one_cost_by_hand():
@@ -100,3 +104,26 @@ def test_advantages_whose_squares_are_zero_stay_small(masked):
         2.0**-80 * torch.randn(50, 1), torch.zeros(50, 1), counted=counted
     )
     assert scaled.abs().max() < 1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: scaled_advantages(torch.zeros(6, 1), torch.zeros(4, 1)), "with the same"),
+        (
+            lambda: scaled_advantages(*torch.zeros(2, 6, 1), cost_scale=torch.ones(3)),
+            r"one column for each scale, got .*\(6, 1\) and scales of shape \(3,\)",
+        ),
+        (
+            lambda: cost_advantage_scale(torch.zeros(3), torch.zeros(6, 1)),
+            r"one column for each scale, got .*\(6, 1\) and scales of shape \(3,\)",
+        ),
+        (
+            lambda: cost_advantage_scale(torch.zeros(1), torch.zeros(6, 1), memory=5.0),
+            "memory must be a number from 0 to 1, got 5.0",
+        ),
+    ],
+)
+def test_what_would_broadcast_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -58,6 +58,13 @@ def test_cost_critics_of_the_wrong_width_are_refused(kind):
 
 
 @each_loss
+@pytest.mark.parametrize("wrong", [None, torch.nn.Linear(2, 1), [torch.nn.Linear(2, 1)] * 2])
+def test_cost_critics_without_keys_are_refused(kind, wrong):
+    with pytest.raises(TypeError, match="cost_qvalue_network must be an instance of TensorDictMod"):
+        kind(make_actor(kind), make_q_critic(), wrong, **OWN[kind])
+
+
+@each_loss
 def test_cost_critics_that_write_another_key_are_refused(kind):
     critic = make_cost_critic(1, key="elsewhere")
     loss = kind(make_actor(kind), make_q_critic(), critic, **OWN[kind])

@@ -20,6 +20,15 @@ def finished(tmp_path_factory):
     return config
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"epochs": 0}, {"eval_episodes": 0}, {"cost_limit": float("nan")}], ids=str
+)
+def test_what_is_refused(wrong):
+    (name,) = wrong
+    with pytest.raises(ValueError, match=name):
+        Config(**wrong)
+
+
 @pytest.mark.slow
 def test_what_it_leaves(finished):
     results = json.loads((finished.out / "results.json").read_text())

@@ -41,6 +41,7 @@ from experiments.config import Config
 from experiments.train import train
 from torchrl_safe import testing
 from torchrl_safe.envs import ArmEnv
+from torchrl_safe.envs.gym import SafeGymEnv
 from torchrl_safe.evaluation import evaluate as play
 from torchrl_safe.policy import load_policy, save_policy
 
@@ -593,6 +594,13 @@ def test_evaluation_in_an_environment_of_ones_own(mine, trained, tmp_path, capsy
     assert "episode cost: fast" in shown
     assert "| 5.00 [5.00, 5.00] |" in shown, "the time limit of that environment"
     assert "Cost limit 3;" in shown
+
+
+def test_costs_of_a_gymnasium_environment_have_their_names():
+    env = SafeGymEnv("counting:Counting-v0", cost_keys=["cost", ("costs", "heat")])
+    assert evaluate.cost_names(env) == ("cost", "costs.heat")
+    assert evaluate.cost_names(TransformedEnv(env)) == ("cost", "costs.heat")
+    env.close()
 
 
 def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):

@@ -403,6 +403,16 @@ def test_wrong_keys(keys):
         SafeGymWrapper(Counting(), cost_keys=keys)
 
 
+def test_a_key_twice_is_refused():
+    with pytest.raises(ValueError, match="cost_keys must be different keys"):
+        SafeGymWrapper(Counting(), cost_keys=["cost", ("cost",)])
+
+
+def test_a_flag_of_another_kind_is_refused():
+    with pytest.raises(TypeError, match="asynchronous must be True or False, got 'no'"):
+        SafeGymEnv("counting:Counting-v0", asynchronous="no")
+
+
 def test_device_is_that_of_the_tensors(make_env):
     env = make_env(SafeGymWrapper, Counting(), device="cpu")
     assert env.rollout(2)["next", "cost"].device == torch.device("cpu")

@@ -9,6 +9,7 @@ from torchrl_safe.envs import (
     Box,
     Capsule,
     Cylinder,
+    Look,
     NoObstacles,
     Part,
     Placement,
@@ -159,6 +160,18 @@ def test_every_shape_is_drawn(make_env):
 )
 def test_bad_arguments(make, message):
     with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Part("x", (0, 0, 0)), "shape must be an instance of Cylinder or .* got 'x'"),
+        (lambda: Look((1, 1, 1), parts=(3,)), "parts must be an instance of Part, got 3"),
+    ],
+)
+def test_what_is_no_shape_is_refused_before_it_is_drawn(make, message):
+    with pytest.raises(TypeError, match=message):
         make()
 
 

@@ -87,6 +87,10 @@ def test_each_argument_with_its_default(config, made):
             assert same(configured, parameter.default), name
 
 
+def test_one_tolerance_for_each_cost():
+    assert OmegaConf.structured(CRPOLossConfig(tolerance=[0.1, 0.2])).tolerance == [0.1, 0.2]
+
+
 def same(configured, default):
     """Equal; functions of functools.partial and torch's transforms compare by what they are."""
     if isinstance(default, torch.distributions.transforms.ComposeTransform):

@@ -216,6 +216,11 @@ def test_pcpo_by_hand():
     assert pcpo_weight(1.0, r=1.0, s=2.0, c=-2.0) == 0.0
 
 
+def test_a_flag_of_another_kind_is_refused():
+    with pytest.raises(TypeError, match="kl_projection must be True or False, got 'no'"):
+        PCPO(kl_projection="no")
+
+
 @pytest.mark.parametrize("method", [CPO, PCPO])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_limit_that_does_not_bind_leaves_the_trpo_step(method, seed):

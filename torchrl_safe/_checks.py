@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Sequence
 from numbers import Real
 from types import UnionType
 from typing import Any, Protocol, get_args
@@ -98,6 +99,23 @@ def check_one_each(name: str, values: Tensor, num_costs: int) -> None:
             f"{name} must be one number or one for each of the {num_costs} costs, got shape "
             f"{tuple(values.shape)}."
         )
+
+
+def check_names(cost_names: Sequence[str] | None, num_costs: int) -> tuple[str, ...]:
+    """Returns the names of the costs; raises ValueError unless there is one for each."""
+    names = [str(index) for index in range(num_costs)] if cost_names is None else cost_names
+    if (
+        isinstance(names, str)
+        or not isinstance(names, Sequence)
+        or not all(isinstance(name, str) for name in names)
+        or len(set(names)) != len(names)
+        or len(names) != num_costs
+    ):
+        raise ValueError(
+            f"cost_names must be a different name for each of the {num_costs} costs, got "
+            f"{cost_names!r}."
+        )
+    return tuple(names)
 
 
 def check_unit(name: str, quaternions: NDArray[Any]) -> None:

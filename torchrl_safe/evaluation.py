@@ -15,7 +15,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_safe._checks import check_count, check_kind
+from torchrl_safe._checks import check_count, check_kind, check_names
 from torchrl_safe.metrics import mean, share, violation_rate
 
 __all__ = ["evaluate", "summarize"]
@@ -120,8 +120,8 @@ def summarize(
         Estimate, lower and upper end, by name of the figure.
 
     Raises:
-        ValueError: if there is not one name for each cost, or fewer than two episodes, which have
-            no interval.
+        ValueError: if there is not a different name for each cost, or fewer than two episodes,
+            which have no interval.
 
     Examples:
         >>> episodes = TensorDict(
@@ -135,12 +135,7 @@ def summarize(
         [2.0, 15.0, 1.0, 0.5]
     """
     costs = episodes["episode_cost"]
-    names = map(str, range(costs.shape[-1])) if cost_names is None else cost_names
-    names = tuple(names)
-    if len(names) != costs.shape[-1]:
-        raise ValueError(
-            f"cost_names must be one for each of the {costs.shape[-1]} costs, got {names}."
-        )
+    names = check_names(cost_names, costs.shape[-1])
     success = episodes.get("success", None)
     estimates = {} if success is None else {"success": share(success)}
     estimates["return"] = mean(episodes["episode_reward"])

@@ -300,7 +300,15 @@ def conditional_value_at_risk(episode_cost: Tensor, alpha: float) -> Tensor:
 
 
 class WorstSeed(NamedTuple):
-    """The highest mean cost of a seed, and which seed it is, each of shape ``(k,)``."""
+    """What :func:`worst_seed` returns: the highest mean cost of a seed, and which seed it is.
+
+    Each has shape ``(k,)``.
+
+    Examples:
+        >>> import torch
+        >>> worst_seed(torch.tensor([[[0.0], [1.0]], [[2.0], [3.0]]])).seed
+        tensor([1])
+    """
 
     value: Tensor
     seed: Tensor

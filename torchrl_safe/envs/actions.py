@@ -107,9 +107,9 @@ class CartesianDelta:
     def __post_init__(self) -> None:
         check_positive(step=self.step)
         check_bound(self.bound)
-        if not callable(self.inverse_kinematics):
+        if isinstance(self.inverse_kinematics, type) or not callable(self.inverse_kinematics):
             raise TypeError(
-                f"inverse_kinematics must be callable, got {self.inverse_kinematics!r}."
+                f"inverse_kinematics must be a callable object, got {self.inverse_kinematics!r}."
             )
         if self.orientation is not None:
             check_unit("orientation", keep_numbers(self, "orientation", 4))

@@ -13,11 +13,13 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+
+# What TorchRL's own set_seed draws the next seed with: batched environments count on it.
 from torchrl._utils import seed_generator
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_safe._checks import check_array, check_count, check_kind
+from torchrl_safe._checks import check_array, check_count, check_flag, check_kind
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, check_bound
 from torchrl_safe.envs.arms import PANDA, ArmModel
 from torchrl_safe.envs.costs import Collision
@@ -129,6 +131,7 @@ class ArmEnv(EnvBase):
         gui: bool = False,
     ) -> None:
         check_count(num_envs=num_envs, frame_skip=frame_skip, max_episode_steps=max_episode_steps)
+        check_flag(gui=gui)
         check_kind("arm", arm, ArmModel, such_as="PANDA")
         check_kind("action", action, ActionMode, such_as="JointDelta()")
         check_kind("task", task, Task, such_as="Reach()")

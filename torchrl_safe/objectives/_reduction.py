@@ -38,7 +38,7 @@ def reduced(
         A number, or with ``"none"`` the values, 0 where they do not count.
 
     Raises:
-        ValueError: if a mask is not bool or does not fit the values.
+        ValueError: if there is no such reduction, or a mask is not bool or does not fit the values.
 
     Examples:
         >>> import torch
@@ -52,6 +52,8 @@ def reduced(
         tensor(1.5000)
     """
     reduction = loss.reduction if reduction is None else reduction
+    if reduction not in ("mean", "sum", "none"):
+        raise ValueError(f'reduction must be "mean", "sum" or "none", got {reduction!r}.')
     mask = counted(loss, tensordict, values)
     if mask is not None:  # Not multiplied by the mask: infinity times 0 is NaN.
         values = torch.where(mask, values, torch.zeros_like(values))

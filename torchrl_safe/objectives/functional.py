@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_safe.objectives._checks import check_columns, check_rows
+from torchrl_safe.objectives._checks import check_columns, check_rows, check_share
 
 
 def scaled_advantages(
@@ -56,6 +56,9 @@ def scaled_advantages(
     Returns:
         Both advantages, scaled.
 
+    Raises:
+        ValueError: if the shapes do not fit together.
+
     Examples:
         >>> import torch
         >>> reward, cost = torch.tensor([[1.0], [3.0]]), torch.tensor([[1.0], [5.0]])
@@ -68,6 +71,9 @@ def scaled_advantages(
         tensor([[-0.7071],
                 [ 0.7071]])
     """
+    check_rows(advantage, cost_advantage)
+    if cost_scale is not None:
+        check_columns(cost_advantage, "scale", cost_scale)
     if standardize and advantage.numel() > 1:  # One alone has no deviation.
         advantage = standardized(advantage, counted, exclude_dims)
     cost_advantage = centred(cost_advantage, counted)
@@ -103,12 +109,17 @@ def cost_advantage_scale(
     Returns:
         The scale, shape ``(k,)``; that of the past where the batch has a NaN or an infinity.
 
+    Raises:
+        ValueError: if ``past`` has another number of costs, or ``memory`` is not from 0 to 1.
+
     Examples:
         >>> import torch
         >>> scale = cost_advantage_scale(torch.zeros(1), torch.tensor([[3.0], [-3.0]]))
         >>> scale, cost_advantage_scale(scale, torch.zeros(2, 1))
         (tensor([4.2426]), tensor([4.1578]))
     """
+    check_columns(cost_advantage, "scale", past)
+    memory = check_share("memory", memory)
     rows = tuple(range(cost_advantage.ndim - 1))
     if counted is not None:  # What does not count may be NaN.
         counted = counted.expand_as(cost_advantage)

@@ -31,6 +31,8 @@ except ImportError as error:
     ) from error
 from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
+
+# What TorchRL's configurations are made with: it has no public way to add a trainer's.
 from torchrl.trainers.algorithms.configs.common import ConfigBase, _normalize_hydra_key
 from torchrl.trainers.algorithms.configs.envs_libs import EnvLibsConfig
 from torchrl.trainers.algorithms.configs.objectives import LossConfig
@@ -101,7 +103,7 @@ class LagrangianLossConfig(WrappingLossConfig):
 class CRPOLossConfig(WrappingLossConfig):
     """Configuration of :class:`~torchrl_safe.objectives.CRPOLoss`."""
 
-    tolerance: float = 0.0
+    tolerance: Any = 0.0
     normalize_cost_advantage: bool = True
     _target_: str = "torchrl_safe.objectives.CRPOLoss"
 
@@ -210,7 +212,14 @@ def make_constrained_ppo_trainer(
 
 
 def register_configs() -> None:
-    """Puts the configurations into Hydra's store. Call it before Hydra composes."""
+    """Puts the configurations into Hydra's store. Call it before Hydra composes.
+
+    Examples:
+        >>> from hydra.core.config_store import ConfigStore
+        >>> register_configs()
+        >>> sorted(ConfigStore.instance().list("updater"))
+        ['dual_ascent.yaml', 'pid_control.yaml', 'violation.yaml']
+    """
     store = ConfigStore.instance().store
     store(group="env", name="arm", node=ArmEnvConfig)
     store(group="loss", name="lagrangian", node=LagrangianLossConfig)

@@ -101,8 +101,6 @@ class ConstrainedPPOTrainer(PPOTrainer):
         80
     """
 
-    _algo_name = "constrained PPO"
-
     def __init__(
         self,
         *,

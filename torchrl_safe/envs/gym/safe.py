@@ -22,10 +22,13 @@ from torchrl.envs import EnvBase, GymEnv, GymWrapper
 from torchrl.envs.gym_like import BaseInfoDictReader
 from torchrl.envs.libs.gym import terminal_obs_reader
 
-from torchrl_safe._checks import check_array, check_count
+from torchrl_safe._checks import check_array, check_count, check_flag
 from torchrl_safe.envs.gym import autoreset, safety_gymnasium
 
 
+# TorchRL has no public hook between a Gymnasium environment and its tensordicts. What is private
+# here, it calls or sets itself: _build_env and _async_env make the environment, _is_batched and
+# _convert_actions_to_numpy say of what kind it is.
 class _CostBesideReward(GymWrapper):
     """What :class:`SafeGymWrapper` and :class:`SafeGymEnv` add to TorchRL's classes."""
 
@@ -37,6 +40,8 @@ class _CostBesideReward(GymWrapper):
                 f"cost_keys must be a sequence of at least one key, got {cost_keys!r}."
             )
         keys = [unravel_key(key) for key in cost_keys]
+        if len(set(keys)) < len(keys):
+            raise ValueError(f"cost_keys must be different keys, got {cost_keys!r}.")
         self._cost_paths = [(key,) if isinstance(key, str) else key for key in keys]
         super().__init__(*args, **kwargs)
 
@@ -266,7 +271,7 @@ class SafeGymWrapper(_CostBesideReward):
 
     Raises:
         TypeError: if ``env`` is a name.
-        ValueError: if ``cost_keys`` is empty, or a cost is not a finite number.
+        ValueError: if ``cost_keys`` is empty or has a key twice, or a cost is not a finite number.
         KeyError: if a step does not report a cost.
 
     Examples:
@@ -296,16 +301,17 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
         cost_keys (Sequence[NestedKey], optional): the entries of ``info`` that are costs.
             Defaults to ``("cost",)``.
         num_envs (int, optional): number of environments in a batch. Defaults to ``0``: one
-            environment without a batch dimension. (TorchRL's ``num_workers`` has no effect here;
-            use :class:`~torchrl.envs.ParallelEnv`.)
+            environment without a batch dimension. (TorchRL takes ``num_workers`` away before this
+            class sees it; use :class:`~torchrl.envs.ParallelEnv`.)
         asynchronous (bool, optional): with ``num_envs``, whether each environment has a process of
             its own. If not, they step one after the other in this process, which is faster if a
             step takes less than about a millisecond. Defaults to ``True``.
         **kwargs: arguments of :class:`~torchrl.envs.GymEnv` and of the environment.
 
     Raises:
-        TypeError: if ``env_name`` is not a string.
-        ValueError: if ``num_envs`` is not a whole number of at least 0.
+        TypeError: if ``env_name`` is not a string, or ``asynchronous`` no flag.
+        ValueError: if ``cost_keys`` is empty or has a key twice, or ``num_envs`` is not a whole
+            number of at least 0.
 
     Examples:
         >>> env = SafeGymEnv("torchrl_safe.envs.gym:torchrl_safe/PandaReachInFront-v0")
@@ -322,6 +328,7 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
                 "environment."
             )
         check_count(least=0, num_envs=kwargs.get("num_envs", 0))
+        check_flag(asynchronous=asynchronous)
         self._asynchronous = asynchronous
         super().__init__(env_name, **{"backend": "gymnasium", **kwargs})
 

@@ -27,6 +27,7 @@ class Part:
         orientation: a quaternion (x, y, z, w) in that frame.
 
     Raises:
+        TypeError: if ``shape`` is not a shape.
         ValueError: if ``position`` or ``orientation`` has the wrong shape or is not finite, or
             ``orientation`` is no unit quaternion.
 
@@ -42,6 +43,7 @@ class Part:
     def __post_init__(self) -> None:
         keep_numbers(self, "position", 3)
         check_unit("orientation", keep_numbers(self, "orientation", 4))
+        check_kind("shape", self.shape, Shape)
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Look:
         parts: what is drawn with the shape, such as the body that belongs to a head.
 
     Raises:
+        TypeError: if ``parts`` are not parts.
         ValueError: if ``colour`` is not three numbers from 0 to 1.
 
     Examples:
@@ -67,6 +70,9 @@ class Look:
         colour = keep_numbers(self, "colour", 3)
         if not ((colour >= 0) & (colour <= 1)).all():
             raise ValueError(f"colour must be three numbers from 0 to 1, got {self.colour}.")
+        check_kind("parts", self.parts, Sequence)
+        for part in self.parts:
+            check_kind("parts", part, Part)
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,15 @@ class Nearest(NamedTuple):
 
     k worlds with r pairs each, of a convex shape of the arm that joints move and an obstacle or
     the table. Each pair of shapes has one, or some more where a simulator finds several.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_safe.envs import PANDA, MuJoCo, Scene
+        >>> world = MuJoCo().build(PANDA, Scene(), num_envs=1, reach=1.0)
+        >>> nearest = world.nearest(np.arange(1), world.state().joint_position, np.zeros((1, 0)))
+        >>> bool(nearest.distance.min() > 0)  # Home is free.
+        True
+        >>> world.close()
     """
 
     #: Distance of the two points, m, ``(k, r)``; negative where the shapes overlap, infinite where
@@ -53,6 +62,13 @@ class Simulator(Protocol):
 
     Worlds do not depend on each other. What happens in a row is the same, bit for bit, whatever
     the other rows do, and whatever happened in this row before its last :meth:`reset`.
+
+    Examples:
+        >>> from torchrl_safe.envs import PANDA, MuJoCo, Scene
+        >>> world = MuJoCo().build(PANDA, Scene(), num_envs=2)
+        >>> world.state().joint_position.shape
+        (2, 7)
+        >>> world.close()
     """
 
     @property

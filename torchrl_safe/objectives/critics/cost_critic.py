@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import contextlib
 from dataclasses import dataclass
 from typing import Any
@@ -184,9 +185,9 @@ class CostCritic(CostValues):
             hidden = [*self._shared_keys, *(unravel_key(("next", k)) for k in self._shared_keys)]
             tensordict.update(data.exclude(*hidden, *self._end_keys()))
 
+    @abc.abstractmethod
     def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
         """What the cost advantages of this batch are divided by; None if by nothing."""
-        return None
 
     def actor_features(self, tensordict: TensorDictBase) -> TensorDictBase:
         """What the critics read of the actor, computed anew; empty if they read nothing of it."""

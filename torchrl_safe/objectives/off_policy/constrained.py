@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import GAE, ValueEstimatorBase
 
-from torchrl_safe._checks import check_count
+from torchrl_safe._checks import check_count, check_kind
 from torchrl_safe.objectives._checks import get_or_raise, initial_multiplier
 from torchrl_safe.objectives._reduction import report_each
 from torchrl_safe.objectives.critics.cost_td0 import CostTD0
@@ -222,7 +222,12 @@ class ConstrainedQLoss(CostValues):
 def _as_list(
     network: TensorDictModuleBase | Sequence[TensorDictModuleBase],
 ) -> list[TensorDictModuleBase] | None:
-    return None if isinstance(network, TensorDictModuleBase) else list(network)
+    if isinstance(network, TensorDictModuleBase):
+        return None
+    networks = list(network) if isinstance(network, Iterable) else [network]
+    for each in networks:
+        check_kind("cost_qvalue_network", each, TensorDictModuleBase)
+    return networks
 
 
 def _as_tuple(key: NestedKey) -> tuple[str, ...]:

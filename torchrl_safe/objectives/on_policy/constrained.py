@@ -84,7 +84,6 @@ class ConstrainedLoss(CostCritic):
         """Whether cost advantages are divided by their standard deviation. Fixed once made."""
         return self._normalize_cost_advantage
 
-    @torch.no_grad()
     def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
         if not self.normalize_cost_advantage:
             return None

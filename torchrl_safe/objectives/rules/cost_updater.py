@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe._checks import as_tensor, check_one_each
+from torchrl_safe._checks import as_tensor, check_names, check_one_each
 from torchrl_safe.objectives._checks import as_number, check_number, uncompiled
 
 #: Which updaters write which buffer of a loss.
@@ -62,8 +62,8 @@ class CostUpdater(abc.ABC):
 
     @property
     def cost_limit(self) -> Tensor:
-        """The limits, shape ``(k,)``. You can set what the constructor takes."""
-        return self._cost_limit
+        """The limits, shape ``(k,)``, where the loss is. You can set what the constructor takes."""
+        return self._cost_limit.to(getattr(self.loss_module, self.buffer_name))
 
     @cost_limit.setter
     def cost_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> None:
@@ -131,7 +131,7 @@ class CostUpdater(abc.ABC):
         cost = episode_cost.mean(0)
         if len(episode_cost) > 1:  # One alone has no standard error.
             cost = cost + self.pessimism * episode_cost.std(0) / len(episode_cost) ** 0.5
-        violation = cost - self.cost_limit.to(cost)
+        violation = cost - self.cost_limit
         if not (usable := violation.isfinite()).all():
             raise ValueError(
                 f"episode_cost must have a mean and deviation within {violation.dtype}, got "
@@ -180,23 +180,6 @@ class CostUpdater(abc.ABC):
         names = state_dict["cost_names"]
         if self._has_names and names is not None and tuple(names) != self.cost_names:
             raise ValueError(f"The state has the costs {names}, this updater {self.cost_names}.")
-
-
-def check_names(cost_names: Sequence[str] | None, num_costs: int) -> tuple[str, ...]:
-    """Returns the names of the costs; raises ValueError unless there is one for each."""
-    names = [str(index) for index in range(num_costs)] if cost_names is None else cost_names
-    if (
-        isinstance(names, str)
-        or not isinstance(names, Sequence)
-        or not all(isinstance(name, str) for name in names)
-        or len(set(names)) != len(names)
-        or len(names) != num_costs
-    ):
-        raise ValueError(
-            f"cost_names must be a different name for each of the {num_costs} costs of the loss "
-            f"(num_costs), got {cost_names!r}."
-        )
-    return tuple(names)
 
 
 def _in_order(cost_limit: Mapping[str, float], names: tuple[str, ...] | None) -> list[float]:

@@ -142,7 +142,7 @@ class MultiplierUpdater(CostUpdater):
         self.cost_scale = cost_scale
 
     def _scale_of(self, episode_cost: Tensor) -> Tensor:
-        scale = _SHARE_OF_LIMIT * self.cost_limit.to(episode_cost)
+        scale = _SHARE_OF_LIMIT * self.cost_limit
         if len(episode_cost) > 1:
             scale = torch.maximum(scale, episode_cost.std(0))
         # Under a limit of 0 costs that are all the same have no other scale.

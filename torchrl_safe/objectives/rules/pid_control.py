@@ -144,7 +144,7 @@ class PIDControl(MultiplierUpdater):
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
         # The cost, not the violation: a new limit is not a rise of the cost. (A normalized
         # violation has no unit in which the limit could be added.)
-        limit = self.cost_limit.to(multiplier) * (not self.normalize)
+        limit = self.cost_limit * (not self.normalize)
         cost = violation + limit
         previous = self.smoothed_cost.to(multiplier)
         previous = torch.where(previous.isnan(), cost, previous)

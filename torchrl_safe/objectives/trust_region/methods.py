@@ -10,6 +10,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from torchrl_safe._checks import check_flag
 from torchrl_safe.objectives.trust_region.solver import cpo_weights, pcpo_weight, trpo_weight
 
 
@@ -176,6 +177,9 @@ class PCPO(TrustRegionMethod):
         kl_projection (bool, optional): project to the point of least divergence, in the metric
             of the Fisher matrix; if ``False``, to the nearest parameters. Defaults to ``True``.
 
+    Raises:
+        TypeError: if ``kl_projection`` is no flag.
+
     Examples:
         >>> import torch
         >>> gradient, cost_gradient = torch.tensor([1.0, 0.0]), torch.tensor([1.0, 1.0])
@@ -195,6 +199,9 @@ class PCPO(TrustRegionMethod):
 
     kl_projection: bool = True
     constrained = True
+
+    def __post_init__(self) -> None:
+        check_flag(kl_projection=self.kl_projection)
 
     def __call__(self, problem: TrustRegionProblem) -> TrustRegionSolution:
         reward = trpo_weight(_dot(problem.gradient, problem.natural_gradient), problem.max_kl)

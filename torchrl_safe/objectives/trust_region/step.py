@@ -232,7 +232,7 @@ class TrustRegionStep:
             return self._search(actor, batch, start, fixed, problem, self.method(problem))
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the counts and ``episode_length``; the actor is in the state of the loss."""
+        """Returns the counts, ``episode_length`` and ``max_kl``; the loss has the actor."""
         return {name: getattr(self, name) for name in _STATE}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -369,7 +369,7 @@ class TrustRegionStep:
 
 _NUMBERS = ("kl", "surrogate_gain", "cost_surrogate_change", "step_fraction", "constraint_active")
 _COUNTS = ("rejected_steps", "indefinite_steps", "recovery_steps")
-_STATE = (*_COUNTS, "episode_length")
+_STATE = (*_COUNTS, "episode_length", "max_kl")
 
 
 def _checked_gradient(name: str, surrogate: Tensor, actor: ActorCopy) -> Tensor:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torchrl_safe._checks import check_count
+from torchrl_safe._cores import cores
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
@@ -70,7 +70,5 @@ class MuJoCo:
 
 
 def _cores() -> int:
-    """Cores that are ours."""
-    if multiprocessing.parent_process() is not None:
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that are ours; a worker has one."""
+    return 1 if multiprocessing.parent_process() is not None else cores()
