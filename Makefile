@@ -4,6 +4,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# Only what is used is compiled, when it is used.
+PIP_INSTALL := pip install --quiet --no-compile
 # Safety-Gymnasium pins an older Gymnasium and MuJoCo than ours.
 SAFETY := .venv-safety-gymnasium
 SAFETY_FILES := $(addprefix tests/with_safety_gymnasium/,requirements.txt make_importable.py)
@@ -105,21 +107,21 @@ clean:
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(BIN)/$(PIP_INSTALL) --constraint constraints.txt --editable ".[dev]"
 	touch $@
 
 # It pins an old Gymnasium, and runs with ours.
 $(VENV)/.bullet-safety-gym: $(READY)
-	$(BIN)/pip install --quiet --constraint constraints.txt --no-deps bullet-safety-gym
+	$(BIN)/$(PIP_INSTALL) --constraint constraints.txt --no-deps bullet-safety-gym
 	touch $@
 
 $(SAFETY)/.ready: pyproject.toml constraints.txt $(SAFETY_FILES)
 	$(PYTHON) -m venv $(SAFETY)
-	$(SAFETY)/bin/pip install --quiet --constraint constraints.txt --editable . pytest tqdm tyro
-	$(SAFETY)/bin/pip install --quiet --no-deps --requirement tests/with_safety_gymnasium/requirements.txt
+	$(SAFETY)/bin/$(PIP_INSTALL) --constraint constraints.txt --editable . pytest tqdm tyro
+	$(SAFETY)/bin/$(PIP_INSTALL) --no-deps --requirement tests/with_safety_gymnasium/requirements.txt
 	$(SAFETY)/bin/python tests/with_safety_gymnasium/make_importable.py
 	touch $@
 
 $(SAFETY)/.omnisafe: $(SAFETY)/.ready $(OMNISAFE_FILE)
-	$(SAFETY)/bin/pip install --quiet --no-deps --requirement $(OMNISAFE_FILE)
+	$(SAFETY)/bin/$(PIP_INSTALL) --no-deps --requirement $(OMNISAFE_FILE)
 	touch $@
