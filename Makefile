@@ -4,8 +4,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-# Only what is used is compiled, when it is used.
+# Only what is used is compiled, when it is first used, and kept: compiling takes longer than importing.
 PIP_INSTALL := pip install --quiet --no-compile
+export PYTHONDONTWRITEBYTECODE :=
 # Safety-Gymnasium pins an older Gymnasium and MuJoCo than ours.
 SAFETY := .venv-safety-gymnasium
 SAFETY_FILES := $(addprefix tests/with_safety_gymnasium/,requirements.txt make_importable.py)
@@ -31,7 +32,7 @@ PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 test: $(VENV)/.bullet-safety-gym  ## the parts, on two cores; CI also runs test-integration
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL) -m "not integration and not slow" $(ARGS)
 
-test-integration: $(VENV)/.bullet-safety-gym  ## scripts, pages and trainings from beginning to end
+test-integration: $(VENV)/.bullet-safety-gym  ## programs, pages and trainings from beginning to end
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(PARALLEL) -m "integration and not slow" $(ARGS)
 
 # The kernels that every processor has, in place of those that it is best at.

@@ -5,10 +5,9 @@ import multiprocessing
 import signal
 
 import pytest
-import torch
-from worlds import ENGINES, turntable_settings
 
-from torchrl_safe.envs import ArmEnv
+# What takes seconds to import is imported where it is used: the process that only hands out the
+# tests to others loads this file too.
 
 # A shell that runs us in the background has us ignore Ctrl+C, and so all that we start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -16,8 +15,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def pytest_collection_modifyitems(items):
     """Examples in docstrings cannot be marked where they are: these compile whole losses."""
+    compiling = (
+        "torchrl_safe/testing/suite.py",
+        "torchrl_safe/testing/interface.py::torchrl_safe.testing.interface.check_compile",
+    )
     for item in items:
-        if item.nodeid.startswith("torchrl_safe/testing/suite.py"):
+        if item.nodeid.startswith(compiling):
             item.add_marker(pytest.mark.integration)
 
 
@@ -44,9 +47,13 @@ def make_env():
             env.close()
 
 
-@pytest.fixture(params=ENGINES)
+@pytest.fixture(params=["bullet", "mujoco"])
 def engine(request, monkeypatch):
     """Its name: the engine of every ArmEnv that does not say otherwise."""
+    from worlds import ENGINES
+
+    from torchrl_safe.envs import ArmEnv
+
     monkeypatch.setitem(ArmEnv.__init__.__kwdefaults__, "physics", ENGINES[request.param])
     return request.param
 
@@ -54,12 +61,16 @@ def engine(request, monkeypatch):
 @pytest.fixture
 def turntable(tmp_path):
     """Settings of an ArmEnv with a bar that turns about a vertical axis."""
+    from worlds import turntable_settings
+
     return turntable_settings(tmp_path)
 
 
 @pytest.fixture
 def threads():
     """Scripts set the number of PyTorch's threads; puts it back."""
+    import torch
+
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
@@ -77,5 +88,7 @@ def forked_workers():
 @pytest.fixture(autouse=True)
 def seed():
     """Numbers that a test draws do not depend on the tests before it."""
+    import torch
+
     # Of the CPU alone: torch.manual_seed formats the stack for each kind of device not in use.
     torch.default_generator.manual_seed(0)

@@ -6,7 +6,7 @@ import torch
 from scripted import fly, over, straight
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
-from worlds import Places, each_arm, step
+from worlds import ARMS, Places, combinations, step
 
 from torchrl_safe.envs import (
     ArmEnv,
@@ -23,9 +23,11 @@ from torchrl_safe.envs import (
 )
 
 both_engines = pytest.mark.usefixtures("engine")
-ACTIONS = [CartesianDelta(), JointDelta()]
 ROLLING = InFront(shape=Cylinder(mass=1.0))
-by_name = {"ids": lambda value: type(value).__name__}
+WORLDS = {"one": 1, "three": 3}
+ACTIONS = {"cartesian": CartesianDelta(), "joint": JointDelta()}
+LAYOUTS = {"fixed": InFront(), "free": ROLLING, "none": NoObstacles()}
+each_action = pytest.mark.parametrize("action", ACTIONS.values(), ids=ACTIONS)
 
 
 def always(value):
@@ -39,20 +41,19 @@ def towards(env, point):
     return delta.float().clamp(-1, 1)
 
 
-@each_arm
-@pytest.mark.parametrize("num_envs", [1, 3])
-@pytest.mark.parametrize("action", ACTIONS, **by_name)
 @pytest.mark.parametrize(
-    "obstacles", [InFront(), ROLLING, NoObstacles()], ids=["fixed", "free", "none"]
+    ("arm", "num_envs", "action", "obstacles"),
+    combinations(ARMS, WORLDS, ACTIONS, LAYOUTS),
 )
 def test_specs(make_env, arm, num_envs, action, obstacles):
+    num_envs = WORLDS[num_envs]
     costs = {"collision": Collision(), "one": always(1)}
     env = make_env(
         ArmEnv,
-        arm,
+        ARMS[arm],
         num_envs=num_envs,
-        action=action,
-        obstacles=obstacles,
+        action=ACTIONS[action],
+        obstacles=LAYOUTS[obstacles],
         costs=costs,
         max_episode_steps=5,
     )
@@ -105,7 +106,7 @@ def test_observation_of_motion(make_env):
 
 @both_engines
 @pytest.mark.parametrize("obstacles", [InFront(), ROLLING], ids=["fixed", "free"])
-@pytest.mark.parametrize("action", ACTIONS, **by_name)
+@each_action
 def test_same_seed_same_rollout_bit_for_bit(make_env, action, obstacles):
     """In a fresh environment, and again in one that has run before: resets forget everything."""
     settings = {"num_envs": 3, "action": action, "obstacles": obstacles, "max_episode_steps": 9}
@@ -357,6 +358,7 @@ def test_states_and_resets_do_not_remember_touches(make_env):
     assert env.arm_state.contact_distance == np.inf
 
 
+@pytest.mark.integration
 @both_engines
 def test_the_obstacle_stands_in_the_way_and_can_be_passed(make_env):
     """Straight at the goal, every episode collides; over the obstacle, all succeed at no cost."""
@@ -416,7 +418,7 @@ def test_device_is_that_of_the_tensors(make_env):
 
 
 @both_engines
-@pytest.mark.parametrize("action", ACTIONS, **by_name)
+@each_action
 def test_velocities_are_derivatives(make_env, action):
     """At one substep a control step, velocity times 1/240 s is the change of position."""
     env = make_env(ArmEnv, action=action, frame_skip=1, obstacles=NoObstacles(), seed=0)

@@ -107,6 +107,7 @@ def test_names():
     plain.close()
 
 
+@pytest.mark.integration
 def test_gymnasium_imports_the_module_by_name():
     code = f"""
 import gymnasium

@@ -24,6 +24,7 @@ def load(package):
     return set(done.stdout.split())
 
 
+@pytest.mark.integration
 def test_the_losses_need_no_simulator():
     loaded = load("torchrl_safe.objectives")
     assert "torchrl_safe.objectives.on_policy.ppo_lagrangian" in loaded
@@ -31,6 +32,7 @@ def test_the_losses_need_no_simulator():
     assert others == {"torchrl_safe._checks"}
 
 
+@pytest.mark.integration
 def test_testing_needs_the_losses_only():
     """No test runner, no simulator: a user may have another one, or none."""
     code = (
@@ -47,6 +49,7 @@ def test_testing_needs_the_losses_only():
     assert {n for n in loaded if not n.startswith(packages)} == {"torchrl_safe._checks"}
 
 
+@pytest.mark.integration
 def test_the_trainers_need_the_losses_only():
     """Neither environments nor simulator; Hydra for its configurations, which say so."""
     code = (
@@ -68,6 +71,7 @@ def test_the_trainers_need_the_losses_only():
     )
 
 
+@pytest.mark.integration
 def test_the_transforms_need_no_simulator():
     """PyBullet has no wheel for some Pythons: an error says so, but only when an arm is made."""
     code = (
@@ -82,6 +86,7 @@ def test_the_transforms_need_no_simulator():
     assert needed in done.stderr
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("module", "needed"),
     [
@@ -97,6 +102,7 @@ def test_these_need_neither_simulator_nor_environments_nor_losses(module, needed
     assert load(f"torchrl_safe.{module}") == names
 
 
+@pytest.mark.integration
 def test_the_metrics_say_what_they_need():
     code = "import sys; sys.modules['scipy'] = None; import torchrl_safe.metrics"
     done = run_code(code)

@@ -403,6 +403,7 @@ assert status == 0, status
 """
 
 
+@pytest.mark.integration
 def test_a_forked_process_can_forget_an_environment():
     """The threads of its worlds stay behind, and freeing them would wait for these for ever."""
     result = run_code(FORGET)
@@ -414,6 +415,7 @@ def test_there_is_no_window(make_env):
         ArmEnv(physics=ONE, gui=True)
 
 
+@pytest.mark.integration
 def test_a_missing_mujoco_is_told_when_a_world_is_made():
     code = (
         "import sys; sys.modules['mujoco'] = None\n"

@@ -169,6 +169,7 @@ def test_what_a_call_returns_is_announced(kind):
     assert set(loss.out_keys) == set(loss(make_transitions(2)).keys())
 
 
+@pytest.mark.integration
 def test_outputs_can_be_selected_before_torchrl_has_built_the_parent():
     """TorchRL makes a property of a class's list of outputs when that class itself is built."""
     code = (

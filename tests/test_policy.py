@@ -66,6 +66,7 @@ def trained(tmp_path_factory):
     return train_briefly(tmp_path_factory.mktemp("run"))
 
 
+@pytest.mark.integration
 def test_acts_the_same_in_a_fresh_process(trained, tmp_path):
     actor, file = trained
     np.save(tmp_path / "observations.npy", OBSERVATIONS.numpy())

@@ -182,6 +182,7 @@ def gentle(steps):
     return pilot
 
 
+@pytest.mark.integration
 def test_success_costs_nothing_beside_the_person(make_env):
     """To who knows when the person will be gone: in each episode one of some times is right."""
     env = make_world(make_env, "panda-reach-human")
