@@ -47,7 +47,7 @@ def make_env():
             env.close()
 
 
-@pytest.fixture(params=["bullet", "mujoco"])
+@pytest.fixture(params=["bullet", "mujoco"])  # Those of worlds.ENGINES.
 def engine(request, monkeypatch):
     """Its name: the engine of every ArmEnv that does not say otherwise."""
     from worlds import ENGINES

@@ -68,7 +68,7 @@ def test_two_environments_do_not_disturb_each_other(make_env):
 
 def test_open_and_close_leaves_nothing():
     before = open_clients()
-    for _ in range(20):
+    for _ in range(100):
         world = make_world()
         world.close()
         world.close()

@@ -148,9 +148,7 @@ def test_only_whole_seeds_cover_what_seeds_add():
     torch.manual_seed(0)
     costs = torch.randn(20, 1, 150) + torch.randn(20, 10, 150)
     assert coverage(mean(costs, resample="seeds"), 0.0) == pytest.approx(0.95, abs=0.05)
-    # Episodes alone make the interval less than half as wide as it should be: 60 % are covered. The
-    # standard error of a coverage is 0.07.
-    assert coverage(mean(costs[..., :50]), 0.0) < 0.75
+    assert coverage(mean(costs), 0.0) < 0.6
 
 
 # ---------------------------------------------------------------- worst cases
