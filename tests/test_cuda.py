@@ -163,8 +163,10 @@ def test_trust_region_steps(method):
     torch.testing.assert_close(kl_on_gpu, kl, rtol=1e-4, atol=1e-6)
 
 
-# PyTorch's compiler uses what PyTorch and TorchRL have deprecated.
-@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+# PyTorch's compiler uses what PyTorch and TorchRL have deprecated, and recommends less precise kernels.
+@pytest.mark.filterwarnings(
+    "ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:TensorFloat32:UserWarning"
+)
 def test_compiled_and_autocast():
     loss = PPOLagrangianLoss(*make_networks(COSTS), num_costs=COSTS).to("cuda")
     set_multiplier(loss, torch.tensor([0.7, 2.0]))
