@@ -28,6 +28,7 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter
+from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
@@ -50,6 +51,11 @@ from torchrl_safe.policy import save_policy
 
 # The first seed that training does not use. Environments may take seeds of 32 bits only.
 EVALUATION = 2**31
+# What is evaluated. The limit is for the policy with its noise, which is the one that was trained.
+EVALUATIONS = {
+    "evaluation": ExplorationType.DETERMINISTIC,
+    "evaluation_with_noise": ExplorationType.RANDOM,
+}
 # Settings that may differ when a run is resumed: they do not change what is learnt.
 CHANGEABLE = ("out", "logger", "resume", "eval_episodes")
 
@@ -90,7 +96,7 @@ class Config:
     checkpoint_every: int = 10
     """Batches between two checkpoints. At each, all episodes begin anew."""
     eval_episodes: int = 50
-    """Episodes of the final evaluation, with the deterministic policy."""
+    """Episodes of each final evaluation: of the deterministic policy, and with its noise."""
     compile: bool = True
     """Compile the loss in long runs, if there is a C++ compiler: a minute at the start, then
     updates take a third of the time. Of the algorithms, ppo and ppo-lagrangian can be."""
@@ -520,23 +526,31 @@ def main(config: Config) -> dict[str, Any]:
         settings=as_json(config),
     )
     # The statistics of observations stay as they are. Episodes that ended in training end here too.
-    episodes = evaluate(
-        env,
-        agent.actor,
-        config.eval_episodes,
-        seed=EVALUATION + config.seed,
-        max_steps=max(10_000, config.frames),
-    )
+    torch.manual_seed(config.seed)
+    evaluations = {
+        name: summarize(
+            evaluate(
+                env,
+                agent.actor,
+                config.eval_episodes,
+                seed=EVALUATION + config.seed,
+                max_steps=max(10_000, config.frames),
+                exploration_type=exploration_type,
+            ),
+            config.cost_keys,
+        )
+        for name, exploration_type in EVALUATIONS.items()
+    }
     env.close()
     results = {
         "config": dataclasses.asdict(config),
         "versions": versions(),
         "seconds": seconds,
         "history": log.rows,
-        "evaluation": summarize(episodes, config.cost_keys),
+        **evaluations,
     }
     write_whole(config.out / "results.json", json.dumps(results, indent=1, default=str))
-    print(json.dumps(results["evaluation"], indent=1))
+    print(json.dumps(evaluations, indent=1))
     print(f"Results and policy are in {config.out}.")
     return results
 

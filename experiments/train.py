@@ -259,7 +259,7 @@ def demonstrate(config: Config, algorithm: AlgorithmName, training: Training) ->
 
     What one of ``SHARING`` has begun with, the others of the same run begin with too.
     """
-    kept = {name: begun(config, name, training) for name in SHARING}
+    kept = {name: begun(config, name, training) for name in SHARING if algorithm in SHARING}
     if not config.resume and algorithm in kept:
         kept[algorithm].clear()
     if algorithm in kept and any(each.load() is not None for each in kept.values()):
@@ -281,6 +281,7 @@ def begun(config: Config, algorithm: AlgorithmName, training: Training) -> RunCh
             "actor": training.actor,
             "critic": training.loss.critic_network,
             "cost_critic": training.loss.cost_critic_network,
+            "scale": TensorDict(cost_advantage=training.loss.cost_advantage_scale),
             "generators": GlobalRNGState(),
         },
         settings={**lasting(dataclasses.asdict(config), CHANGEABLE), **depends_on},

@@ -163,7 +163,7 @@ def test_trust_region_steps(method):
     torch.testing.assert_close(kl_on_gpu, kl, rtol=1e-4, atol=1e-6)
 
 
-# PyTorch's compiler uses what PyTorch and TorchRL have deprecated, and recommends less precise kernels.
+# PyTorch's compiler uses what PyTorch and TorchRL have deprecated, and advises less precision.
 @pytest.mark.filterwarnings(
     "ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:TensorFloat32:UserWarning"
 )

@@ -17,7 +17,7 @@ from experiments.demonstrations import (
     start_from_demonstrations,
 )
 from experiments.learners import OnPolicyLearner
-from experiments.train import make_env, train, train_and_evaluate
+from experiments.train import SHARING, demonstrate, make_env, train, train_and_evaluate
 
 pytestmark = pytest.mark.integration
 
@@ -226,3 +226,15 @@ def test_pushing_is_learnt(tmp_path):
     config = Config(**{**chosen, "frames": 16_384}, out=tmp_path)
     results = train_and_evaluate(config, "ppo", progress=False)
     assert results["evaluation"]["success"][0] >= 0.8
+
+
+def test_the_scale_of_cost_advantages_is_begun_with_too(tmp_path):
+    """It weighs the multiplier, and falls so slowly that its start counts for a whole training."""
+    scales = []
+    for algorithm in SHARING:
+        training, env, config = make_training(algorithm, obstacles="in-front", out=tmp_path)
+        env.close()
+        demonstrate(config, algorithm, training)
+        scales.append(training.loss.cost_advantage_scale)
+    assert scales[0] > 0
+    assert torch.equal(*scales)

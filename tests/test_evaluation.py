@@ -74,6 +74,18 @@ def test_evaluation_plays_the_first_episode_of_each_seed(make_env):
     assert episodes["steps"][episodes["success"]].max() < 30
 
 
+def test_with_exploration_the_policy_explores(make_env):
+    env = make_env(ArmEnv, num_envs=2, max_episode_steps=20)
+    episodes = evaluate(env, policy, 2, seed=4, exploration_type=ExplorationType.RANDOM)
+    contrary = evaluate(env, lambda td: td.set("action", -fly_left(td["observation"])), 2, seed=4)
+    assert torch.equal(episodes["episode_reward"], contrary["episode_reward"])
+    assert not torch.equal(
+        episodes["episode_reward"], evaluate(env, policy, 2, seed=4)["episode_reward"]
+    )
+    with pytest.raises(TypeError, match="exploration_type must be an instance of"):
+        evaluate(env, policy, 2, seed=4, exploration_type="random")
+
+
 def test_the_sums_are_those_of_reward_sum(make_env):
     """Without the transform, in one process and in batches of batches."""
     settings = {"num_envs": 2, "obstacles": NoObstacles(), "costs": {"one": one, "two": one}}

@@ -127,3 +127,12 @@ def test_advantages_whose_squares_are_zero_stay_small(masked):
 def test_what_would_broadcast_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_one_value_alone_has_no_deviation():
+    advantage, cost = torch.tensor([[[1.0], [3.0], [5.0]]]), torch.zeros(1, 3, 1)
+    assert torch.equal(scaled_advantages(advantage, cost, exclude_dims=(-2,))[0], advantage)
+    with_more = torch.cat([advantage, advantage + 2])
+    expected = torch.tensor([-1.0, 1.0]).mul(0.5**0.5).reshape(2, 1, 1).expand(2, 3, 1)
+    scaled = scaled_advantages(with_more, torch.zeros(2, 3, 1), exclude_dims=(-2,))[0]
+    torch.testing.assert_close(scaled, expected)

@@ -279,3 +279,17 @@ def test_a_rule_is_one_method():
 def test_a_rule_without_the_method_cannot_be_made():
     with pytest.raises(TypeError, match="next_multiplier"):
         MultiplierUpdater(make_module(0.0), cost_limit=1.0)
+
+
+def test_a_state_can_be_loaded_again():
+    """A step after loading changes the optimizer, and not the state."""
+    updater = DualAscent(make_module(0.0), cost_limit=1.0, lr=0.1, optimizer=torch.optim.Adam)
+    updater.step(torch.tensor([[2.0]]))
+    state = updater.state_dict()
+    seen = []
+    for _ in range(2):
+        updater.loss_module.lagrange_multiplier.fill_(1.0)
+        updater.load_state_dict(state)
+        updater.step(torch.tensor([[3.0]]))
+        seen.append(updater.loss_module.lagrange_multiplier.item())
+    assert seen[0] == seen[1]

@@ -341,3 +341,9 @@ def test_batch_of_rows_and_time_equals_the_flat_one():
     rows, flat = loss(batch), loss(batch.reshape(-1))
     for key in (*TRAINS, "cost_explained_variance"):
         torch.testing.assert_close(rows[key], flat[key])
+
+
+def test_separate_losses_need_a_functional_loss():
+    """TorchRL ignores the option without one."""
+    with pytest.raises(ValueError, match="separate_losses must be False with functional=False"):
+        PPOLagrangianLoss(*make_networks(), functional=False, separate_losses=True)

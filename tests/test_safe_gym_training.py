@@ -49,6 +49,9 @@ def test_the_results_and_the_policy(tmp_path):
     assert [row["frames"] for row in results["history"]] == [80, 160, 240, 320, 400]
     assert set(results["evaluation"]) == {"return", "steps", "cost/cost", "any/cost"}
     assert results["evaluation"]["steps"] == [20, 20, 20]
+    with_noise = results["evaluation_with_noise"]
+    assert set(with_noise) == set(results["evaluation"])
+    assert with_noise["return"] != results["evaluation"]["return"]
     assert (tmp_path / "logs" / "ppo-lagrangian").is_dir()
     policy = load_policy(tmp_path / "policy.pt")
     assert policy.settings["env"] == SMALL.env

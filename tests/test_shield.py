@@ -26,6 +26,7 @@ from torchrl_safe.envs import (
     InFront,
     JointDelta,
     Moving,
+    Nearest,
     NoObstacles,
     PickAndPlace,
     Placement,
@@ -580,3 +581,29 @@ def test_no_sequence_that_is_searched_for_touches(make_env, action):
     tally = attack.evolve(env, generations=20, length=20)
     assert tally.touches == tally.table == 0, str(tally)
     assert tally.nearest < 0.05
+
+
+class _Fist:
+    """A joint q and a finger f, at a distance of 0.05 - f - q**2 / 2 from an obstacle."""
+
+    def __init__(self):
+        self.measured = []
+
+    def nearest(self, rows, angles, fingers):
+        distance = 0.05 - fingers - angles**2 / 2
+        self.measured.append(distance)
+        nothing = np.zeros((len(rows), 1, 3))
+        jacobian = np.stack([-angles, -np.ones_like(fingers)], -1)
+        return Nearest(distance, nothing, nothing, jacobian, np.array([0]))
+
+
+def test_what_the_fingers_use_up_counts_when_it_looks_ahead():
+    """Where the step begins, the joint seems to be free to move."""
+    world = _Fist()
+    joint = dict.fromkeys(("joint_position", "joint_velocity", "finger_position"), np.zeros((2, 1)))
+    state = make_state(**joint, joint_lower=[-9.0], joint_upper=[9.0])
+    shield = Shield(margin=0.0, table=0.0, acceleration=1e4)
+    asked = np.full((2, 1), 0.2), np.full((2, 1), 0.0315)
+    done = shield(*asked, state, world, longest=np.array([0.2]), duration=0.05)
+    assert len(world.measured) == 2
+    assert (world.nearest(range(2), done.joints, done.fingers).distance > 0).all()

@@ -29,8 +29,9 @@ def evaluate(
     *,
     seed: int,
     max_steps: int = 10_000,
+    exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
 ) -> TensorDict:
-    """Plays episodes with the deterministic policy.
+    """Plays episodes, by default with the deterministic policy.
 
     Each environment of a batch plays whole episodes, one after the other. (TorchRL's ``Evaluator``
     takes the first episodes that end, which are the short ones.)
@@ -48,6 +49,10 @@ def evaluate(
     Keyword Args:
         seed (int): seed of the episodes. With the same seed every policy meets the same episodes.
         max_steps (int, optional): steps in which every episode must end. Defaults to ``10_000``.
+        exploration_type (ExplorationType, optional): how actions are drawn.
+            ``ExplorationType.RANDOM`` plays the policy with its noise, as it was trained; that can
+            cost much less, or more. The noise is PyTorch's: ``seed`` does not set it, call
+            :func:`torch.manual_seed`. Defaults to ``ExplorationType.DETERMINISTIC``.
 
     Returns:
         A TensorDict of shape ``(E,)`` with, for each episode, ``episode_reward`` of shape
@@ -57,7 +62,8 @@ def evaluate(
         ``RewardSum([("agent", "reward"), ("agent", "cost")], ["episode_reward", "episode_cost"])``.
 
     Raises:
-        TypeError: if ``env`` is no environment, or ``policy`` cannot be called.
+        TypeError: if ``env`` is no environment, ``policy`` cannot be called, or
+            ``exploration_type`` is none.
         ValueError: if the environment has no cost or no reward, or an episode has not ended after
             ``max_steps``.
 
@@ -76,6 +82,7 @@ def evaluate(
     if not callable(policy):
         raise TypeError(f"policy must be callable, got {policy!r}.")
     check_count(episodes=episodes, max_steps=max_steps)
+    check_kind("exploration_type", exploration_type, ExplorationType)
     specs = {**env.full_observation_spec, **env.full_reward_spec}
     for name in ("reward", "cost"):
         spec = specs.get(f"episode_{name}", specs.get(name))
@@ -95,7 +102,7 @@ def evaluate(
                 "a float, a sum of flags is a flag."
             )
     rounds = []
-    with set_exploration_type(ExplorationType.DETERMINISTIC), _in_evaluation_mode(policy):
+    with set_exploration_type(exploration_type), _in_evaluation_mode(policy):
         for _ in range(math.ceil(episodes / env.batch_size.numel())):
             seed = env.set_seed(seed)
             rounds.append(_play(env, policy, max_steps))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -74,7 +75,7 @@ def scaled_advantages(
     check_rows(advantage, cost_advantage)
     if cost_scale is not None:
         check_columns(cost_advantage, "scale", cost_scale)
-    if standardize and advantage.numel() > 1:  # One alone has no deviation.
+    if standardize:
         advantage = standardized(advantage, counted, exclude_dims)
     cost_advantage = centred(cost_advantage, counted)
     if cost_scale is not None:
@@ -144,10 +145,13 @@ def standardized(
     """Brings values to mean 0 and standard deviation 1, over those that count.
 
     As TorchRL's ``normalize_advantage``: the deviation of a masked batch is divided by its count.
-    A deviation below a millionth of the largest value counts as rounding.
+    A deviation below a millionth of the largest value counts as rounding. One value alone has none,
+    and stays as it is.
     """
     excluded = {dim % values.ndim for dim in exclude_dims}
     dims = tuple(dim for dim in range(values.ndim) if dim not in excluded)
+    if math.prod(values.shape[dim] for dim in dims) == 1:
+        return values
     of_counted = values if counted is None else torch.where(counted, values, 0.0)
     # The squares of less are 0, and so would the deviation be.
     least = torch.finfo(values.dtype).tiny ** 0.5

@@ -231,7 +231,8 @@ class Shield:
             tool[pressed] = 0  # The shortest way out.
         change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper, tool)
         # Measure the end of the step as well where it could be too near.
-        left = near.room - near.closing + (near.joints @ change[:, :, None])[:, :, 0]
+        moved = near.joints @ change[:, :, None] + near.fingers @ opening[:, :, None]
+        left = near.room - near.closing + moved[:, :, 0]
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
         again = np.flatnonzero(solved & doubt)
         if len(again):

@@ -76,6 +76,11 @@ class CostCritic(CostValues):
         if device is not None:
             kwargs["device"] = device
         super().__init__(*args, **kwargs)
+        if self.separate_losses and not self.functional:
+            raise ValueError(
+                "separate_losses must be False with functional=False, got True: only a functional "
+                "loss can leave shared parameters out of a critic's loss."
+            )
         self.num_costs = num_costs
         if self.functional:
             policy = list(self.actor_network.parameters()) if self.separate_losses else None

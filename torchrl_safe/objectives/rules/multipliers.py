@@ -305,4 +305,5 @@ class DualAscent(MultiplierUpdater):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         super().load_state_dict(state_dict)
-        self.optimizer.load_state_dict(state_dict["optimizer"])
+        # The optimizer would go on in the tensors that it is given.
+        self.optimizer.load_state_dict(copy.deepcopy(state_dict["optimizer"]))

@@ -44,7 +44,6 @@ class ActorCopy:
         self._copies = actor_params(loss).apply(copy)
         self._originals = actor_parameters(loss)
         self.parameters = [copies[id(parameter)] for parameter in self._originals]
-        self._start = [parameter.detach().clone() for parameter in self.parameters]
 
     def distribution(self, tensordict: TensorDictBase) -> Distribution:
         """The policy in the states of a batch, which must be in the precision of the copy."""
@@ -63,9 +62,9 @@ class ActorCopy:
     def move(self, step: Tensor) -> None:
         """Sets the copy to where it started plus a step, rounded as the actor will hold it."""
         sizes = [parameter.numel() for parameter in self.parameters]
-        parts = zip(step.split(sizes), self.parameters, self._start, self._originals, strict=True)
-        for part, parameter, start, original in parts:
-            parameter.copy_((start + part.view_as(start)).to(original.dtype))
+        parts = zip(step.split(sizes), self.parameters, self._originals, strict=True)
+        for part, parameter, original in parts:
+            parameter.copy_((original + part.view_as(original)).to(original.dtype))
 
     @torch.no_grad()
     def commit(self) -> None:

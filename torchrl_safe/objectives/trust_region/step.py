@@ -237,8 +237,9 @@ class TrustRegionStep:
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Loads a state that :meth:`state_dict` returned."""
-        for name in _STATE:
-            setattr(self, name, state_dict[name])
+        state = {name: state_dict[name] for name in _STATE}
+        for name, value in state.items():
+            setattr(self, name, value)
 
     @torch.no_grad()
     def _read(self, tensordict: TensorDictBase) -> _Batch:
