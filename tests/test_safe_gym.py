@@ -213,6 +213,26 @@ def test_named_observations(make_env, mode):
     check_counts(rollout, [4, 3])
 
 
+@pytest.mark.parametrize("named", [False, True], ids=["array", "dict"])
+def test_an_environment_may_return_the_same_array_again(make_env, named):
+    class Frugal(Counting):
+        array = np.zeros(1, np.float32)
+        box = Counting.observation_space
+        observation_space = Dict(observation=box) if named else box
+
+        def written(self, count, *others):
+            self.array[:] = count
+            return {"observation": self.array} if named else self.array, *others
+
+        def reset(self, **kwargs):
+            return self.written(*super().reset(**kwargs))
+
+        def step(self, action):
+            return self.written(*super().step(action))
+
+    check_counts(make_env(SafeGymWrapper, Frugal(4)).rollout(9, break_when_any_done=False), [4])
+
+
 def test_costs_of_skipped_frames_add_up(make_env):
     env = make_env(SafeGymEnv, "counting:Counting-v0", steps=5, frame_skip=2)
     rollout = env.rollout(3)
@@ -437,7 +457,7 @@ def test_same_step_refuses_to_reset_another_than_what_is_done(make_env):
     for _ in range(3):  # The second row ends.
         td = env.step(env.rand_action(td))["next"]
     assert td["done"].flatten().tolist() == [False, True]
-    with pytest.raises(RuntimeError, match="They reset themselves"):
+    with pytest.raises(RuntimeError, match=r"make them with AutoresetMode\.DISABLED"):
         env.reset(td.set("_reset", ~td["done"]))
 
 

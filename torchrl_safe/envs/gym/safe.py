@@ -6,6 +6,7 @@ Import from :mod:`torchrl_safe.envs.gym`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -88,7 +89,8 @@ class _CostBesideReward(GymWrapper):
 
     def read_obs(self, observations: Any) -> dict[str, Any]:
         if isinstance(observations, Mapping):
-            return super().read_obs(observations)
+            # Environments may write the next observation into the same arrays.
+            return super().read_obs(deepcopy(observations))
         key, spec = self._one_observation
         return {key: _encode(spec, observations)}
 
@@ -122,7 +124,7 @@ class _CostBesideReward(GymWrapper):
             return super()._reset(tensordict, **kwargs)
         raise RuntimeError(
             "They reset themselves: only environments that are done can be reset apart from the "
-            "others."
+            "others. Where a transform ends episodes, make them with AutoresetMode.DISABLED."
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

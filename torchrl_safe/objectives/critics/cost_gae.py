@@ -140,7 +140,8 @@ class CostGAE(GAE):
             raise ValueError(
                 f"The cost {self.tensor_keys.reward!r} and its value {self.tensor_keys.value!r} "
                 f"must have one column for each constraint, got shapes {tuple(reward.shape)} and "
-                f"{tuple(value.shape)}. (A cost that agents share needs a done that they share.)"
+                f"{tuple(value.shape)}. The cost critic needs an output for each of num_costs. "
+                "(A cost that agents share needs a done that they share.)"
             )
         return (
             reward,
