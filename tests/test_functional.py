@@ -136,3 +136,8 @@ def test_one_value_alone_has_no_deviation():
     expected = torch.tensor([-1.0, 1.0]).mul(0.5**0.5).reshape(2, 1, 1).expand(2, 3, 1)
     scaled = scaled_advantages(with_more, torch.zeros(2, 3, 1), exclude_dims=(-2,))[0]
     torch.testing.assert_close(scaled, expected)
+
+
+def test_nothing_stays_nothing():
+    empty = torch.zeros(0, 1)
+    assert [part.shape for part in scaled_advantages(empty, empty)] == [(0, 1), (0, 1)]

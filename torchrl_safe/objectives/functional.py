@@ -150,7 +150,7 @@ def standardized(
     """
     excluded = {dim % values.ndim for dim in exclude_dims}
     dims = tuple(dim for dim in range(values.ndim) if dim not in excluded)
-    if math.prod(values.shape[dim] for dim in dims) == 1:
+    if math.prod(values.shape[dim] for dim in dims) <= 1:
         return values
     of_counted = values if counted is None else torch.where(counted, values, 0.0)
     # The squares of less are 0, and so would the deviation be.

@@ -45,7 +45,8 @@ class LagrangianLoss(ConstrainedLoss, WrappedLoss):
         cost_critic_coeff (float, optional): weight of the cost critic's loss.
             Defaults to ``1.0``.
         separate_losses (bool, optional): leave parameters that the cost critic shares with the
-            policy out of the cost critic's loss. Defaults to ``False``.
+            policy out of the cost critic's loss. ``loss_module`` must be functional. Defaults to
+            ``False``.
         normalize_cost_advantage (bool, optional): divide the cost advantages by their standard
             deviation, as :func:`~torchrl_safe.objectives.scaled_advantages` says, so that a
             multiplier has no unit. Defaults to ``True``.
