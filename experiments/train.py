@@ -259,16 +259,17 @@ def demonstrate(config: Config, algorithm: AlgorithmName, training: Training) ->
 
     What one of ``SHARING`` has begun with, the others of the same run begin with too.
     """
-    kept = {name: begun(config, name, training) for name in SHARING if algorithm in SHARING}
-    if not config.resume and algorithm in kept:
+    sharing = SHARING if algorithm in SHARING else ()
+    kept = {name: begun(config, name, training) for name in sharing}
+    if kept and not config.resume:
         kept[algorithm].clear()
-    if algorithm in kept and any(each.load() is not None for each in kept.values()):
+    if any(each.load() is not None for each in kept.values()):
         return
     seed = config.seed + 2_000_000
     env = make_env(config, config.envs, seed, algorithm, training=True)
     start_from_demonstrations(training, env, config)
     env.close()
-    if algorithm in kept:
+    if kept:
         kept[algorithm].save(config.demonstrations)
 
 

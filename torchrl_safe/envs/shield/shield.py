@@ -218,9 +218,8 @@ class Shield:
         now = self._with_tool(step, near, pressed)
         asked = np.where(pressed[:, None], 0.0, joints - angles)
         lower, upper = self._bounds(step, now, longest)
-        least = self._least(step, now)
-        if opening.any():
-            least = least - (now.fingers @ opening[:, :, None])[:, :, 0]
+        by_fingers = (now.fingers @ opening[:, :, None])[:, :, 0]
+        least = self._least(step, now) - by_fingers
         least = _attainable(now.joints, least, lower, upper)
         # If nothing leaves enough room to stop, take what stops above the margin.
         last = np.minimum(least, now.closing - now.room)
@@ -231,8 +230,8 @@ class Shield:
             tool[pressed] = 0  # The shortest way out.
         change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper, tool)
         # Measure the end of the step as well where it could be too near.
-        moved = near.joints @ change[:, :, None] + near.fingers @ opening[:, :, None]
-        left = near.room - near.closing + moved[:, :, 0]
+        left = near.room - near.closing + (near.joints @ change[:, :, None])[:, :, 0]
+        left += by_fingers[:, : left.shape[1]]  # Not the rows of the tool point.
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
         again = np.flatnonzero(solved & doubt)
         if len(again):
