@@ -13,6 +13,8 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper, Transform, TransformedEnv
 
+from torchrl_safe.envs import CostToReward
+
 FLAGS = ("done", "terminated", "truncated")
 
 
@@ -150,3 +152,13 @@ def flagged(*transforms):
     for transform in transforms:
         env.append_transform(transform)
     return env
+
+
+def with_costs(num_envs=None, num_costs=1):
+    shape = () if num_envs is None else (num_envs,)
+    costs = {f"cost_{index}": shape for index in range(num_costs)}
+    return TransformedEnv(CountingBatch(num_envs, costs=costs), CostToReward(list(costs)))
+
+
+def inside(transform, num_envs=None, num_costs=1):
+    return with_costs(num_envs, num_costs).append_transform(transform())

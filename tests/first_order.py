@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 from on_policy import around
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss, PPOLoss
 
 from torchrl_safe.objectives import (
     CRPOLoss,
@@ -63,3 +63,8 @@ def old_policy(data):
 def actor_gradient(loss, value):
     parameters = list(loss.actor_network_params.values(True, True))
     return torch.cat([g.flatten() for g in torch.autograd.grad(value, parameters)])
+
+
+def parent_of(name, **kwargs):
+    actor, critic, _ = make_networks()
+    return (PPOLoss if name == "focops" else ClipPPOLoss)(actor, critic, **kwargs)

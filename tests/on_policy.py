@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import pytest
 import torch
 from tensordict.nn import (
     CompositeDistribution,
@@ -16,6 +17,7 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, PPOLoss, Rein
 
 from torchrl_safe.objectives import (
     CRPOLoss,
+    CUPLoss,
     FOCOPSLoss,
     IPOLoss,
     LagrangianLoss,
@@ -167,3 +169,37 @@ def train(loss, data, updates=20):
 def estimated(loss, num_costs=1, seed=1):
     """A flat batch with both advantages."""
     return loss.estimate_advantages(make_batch(num_costs, seed=seed)).reshape(-1)
+
+
+SUBCLASSES = {
+    "ppo-lagrangian": (PPOLagrangianLoss, ClipPPOLoss),
+    "focops": (partial(FOCOPSLoss, kl_bound=float("inf"), temperature=1.0), PPOLoss),
+    "cup": (CUPLoss, ClipPPOLoss),
+    "p3o": (P3OLoss, ClipPPOLoss),
+    "ipo": (IPOLoss, ClipPPOLoss),
+    "trust-region": (TrustRegionLoss, PPOLoss),
+    "lagrangian-clip-ppo": (around(LagrangianLoss, ClipPPOLoss), ClipPPOLoss),
+    "lagrangian-kl-ppo": (around(LagrangianLoss, KLPENPPOLoss), KLPENPPOLoss),
+    "crpo-clip-ppo": (around(CRPOLoss, ClipPPOLoss), ClipPPOLoss),
+}
+
+# These evaluate their policy on a copy of their own: the trunk is evaluated once more.
+OTHERS = {
+    "lagrangian-a2c": (around(LagrangianLoss, A2CLoss), A2CLoss),
+    "lagrangian-reinforce": (around(LagrangianLoss, ReinforceLoss), ReinforceLoss),
+    "crpo-a2c": (around(CRPOLoss, A2CLoss), A2CLoss),
+}
+
+every_loss = pytest.mark.parametrize(
+    "make", [make for make, _ in SUBCLASSES.values()], ids=SUBCLASSES
+)
+
+all_losses = pytest.mark.parametrize(
+    "make", [make for make, _ in {**SUBCLASSES, **OTHERS}.values()], ids=[*SUBCLASSES, *OTHERS]
+)
+
+
+def free(loss):
+    """Moves a loss as far from its limits as a number can be."""
+    if "cost_violation" in dict(loss.named_buffers()):
+        loss.cost_violation.fill_(-1e30)

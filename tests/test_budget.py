@@ -1,20 +1,17 @@
 """Saute and EarlyTermination: budgets by hand, in all kinds of environments."""
 
-import math
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from counting import CountingBatch, flagged
-from tensordict import TensorDict
+from counting import CountingBatch, flagged, inside, with_costs
 from torch.testing import assert_close
 from torchrl.collectors import Collector
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Unbounded
 from torchrl.envs import (
     CatTensors,
     Compose,
-    EnvBase,
     ParallelEnv,
     RewardSum,
     SerialEnv,
@@ -25,7 +22,6 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_safe.envs import ArmEnv, CostToReward, EarlyTermination, Saute, Speed
-from torchrl_safe.envs.transforms.budget import CostTally
 
 # In step t of a CountingBatch: reward 10 t, cost t / 4; row r is truncated after r + 2 steps.
 WRAPPED = {
@@ -33,16 +29,6 @@ WRAPPED = {
     "serial": partial(SerialEnv, 2),
     "parallel": partial(ParallelEnv, 2, mp_start_method="fork"),
 }
-
-
-def with_costs(num_envs=None, num_costs=1):
-    shape = () if num_envs is None else (num_envs,)
-    costs = {f"cost_{index}": shape for index in range(num_costs)}
-    return TransformedEnv(CountingBatch(num_envs, costs=costs), CostToReward(list(costs)))
-
-
-def inside(transform, num_envs=None, num_costs=1):
-    return with_costs(num_envs, num_costs).append_transform(transform())
 
 
 def build(make_env, transform, num_envs, wrap, outside, num_costs=1):
@@ -73,9 +59,6 @@ def in_all_environments(test):
     for mark in everywhere:
         test = mark(test)
     return test
-
-
-# ---------------------------------------------------------------- Saute
 
 
 @in_all_environments
@@ -162,9 +145,6 @@ def test_a_missing_budget_is_named():
     env.append_transform(CatTensors(["observation", "remaining_budget"], "augmented"))
     with pytest.raises(KeyError, match=r"'remaining_budget' must come from the step .*del_keys"):
         env.rollout(2)
-
-
-# ---------------------------------------------------------------- EarlyTermination
 
 
 @in_all_environments
@@ -308,162 +288,11 @@ def test_keys_can_be_nested(make_env):
     assert rollout["used"].flatten().tolist() == [0.25, 0.75]
 
 
-class Crew(EnvBase):
-    """Two worlds with three agents, which have costs and perhaps done flags of their own.
-
-    In each step agent a costs a + 1, of each of two costs. World 0 ends after two steps.
-    """
-
-    def __init__(self, ends_by_agent):
-        super().__init__(batch_size=(2,))
-        self.ends_by_agent = ends_by_agent
-
-        def agents(**specs):
-            return Composite(agents=Composite(specs, shape=(2, 3)), shape=(2,))
-
-        self.observation_spec = agents(observation=Unbounded((2, 3, 1)))
-        self.action_spec = agents(action=Unbounded((2, 3, 1)))
-        self.reward_spec = agents(reward=Unbounded((2, 3, 1)), cost=Unbounded((2, 3, 2)))
-        names = ("done", "terminated", "truncated")
-        if ends_by_agent:
-            self.done_spec = agents(**{n: Unbounded((2, 3, 1), dtype=torch.bool) for n in names})
-        else:
-            flags = {n: Unbounded((2, 1), dtype=torch.bool) for n in names}
-            self.done_spec = Composite(flags, shape=(2,))
-        self.time = torch.zeros(2, 1)
-
-    def state(self, **entries):
-        ended = self.time >= torch.tensor([[2.0], [100.0]])
-        everyone = self.time[:, None].expand(2, 3, 1)
-        agents = {"observation": everyone.clone(), **entries}
-        flags = {"done": ended, "terminated": ended.clone(), "truncated": torch.zeros_like(ended)}
-        if self.ends_by_agent:
-            agents |= {name: flag[:, None].expand(2, 3, 1).clone() for name, flag in flags.items()}
-            flags = {}
-        return TensorDict({"agents": TensorDict(agents, (2, 3)), **flags}, (2,))
-
-    def _reset(self, tensordict=None, **kwargs):
-        key = ("agents", "_reset") if self.ends_by_agent else "_reset"
-        mask = None if tensordict is None else tensordict.get(key, None)
-        some = torch.ones(2, 1) if mask is None else mask.reshape(2, -1)[:, :1]
-        self.time = torch.where(some.bool(), 0.0, self.time)
-        return self.state()
-
-    def _step(self, tensordict):
-        self.time = self.time + 1
-        cost = torch.arange(1.0, 4.0)[:, None].expand(2, 3, 2).clone()
-        return self.state(reward=torch.ones(2, 3, 1), cost=cost)
-
-    def _set_seed(self, seed):
-        pass
-
-
-AGENTS = {"cost_key": ("agents", "cost"), "reward_key": ("agents", "reward")}
-
-
-@pytest.mark.parametrize(
-    ("kind", "ends_by_agent"), [("saute", False), ("saute", True), ("early", True)]
-)
-def test_each_agent_has_a_tally(kind, ends_by_agent):
-    keys = {**AGENTS, "out_key": ("agents", "tally")}
-    if kind == "saute":
-        transform = Saute(100.0, unsafe_reward=-1.0, **keys)
-    else:  # It wants a done flag for each agent that has a budget.
-        flags = {"terminated_key": ("agents", "terminated"), "done_key": ("agents", "done")}
-        transform = EarlyTermination(100.0, **keys, **flags)
-    env = TransformedEnv(Crew(ends_by_agent), transform)
-    check_env_specs(env)
-    collector = Collector(env, frames_per_batch=8, total_frames=8)
-    (batch,) = collector
-    collector.shutdown()
-    assert batch["agents"].batch_size == (2, 4, 3)
-    tally = batch["next", "agents", "tally"][..., 0]
-    used = 100 * (1 - tally) if kind == "saute" else tally
-    steps = torch.tensor([[1, 2, 1, 2], [1, 2, 3, 4]])  # World 0 begins anew after two.
-    assert_close(used, steps[:, :, None] * torch.arange(1.0, 4.0), atol=1e-4, rtol=0)
-
-
-def test_the_tallies_of_agents_may_stand_in_a_group_of_their_own():
-    saute = Saute(100.0, unsafe_reward=-1.0, **AGENTS, out_key=("budget", "left"))
-    env = TransformedEnv(Crew(ends_by_agent=False), saute)
-    check_env_specs(env)
-    assert env.rollout(2)["next", "budget", "left"].shape == (2, 2, 3, 2)
-
-
 def test_budgets_are_part_of_the_state():
     saved = inside(partial(EarlyTermination, 0.7))
     loaded = inside(partial(EarlyTermination, 5.0))
     loaded.load_state_dict(saved.state_dict())
     assert loaded.transform[-1].budget == saved.transform[-1].budget
-
-
-# ---------------------------------------------------------------- what they are for
-
-
-class Choices(EnvBase):
-    """Three steps. An action of 1 earns 1 and costs 1; an action of 0 earns and costs nothing."""
-
-    def __init__(self, num_envs):
-        super().__init__(batch_size=[num_envs])
-        column = Unbounded((num_envs, 1))
-        self.observation_spec = Composite(observation=column.clone(), shape=[num_envs])
-        self.action_spec = column.clone()
-        self.reward_spec = Composite(reward=column.clone(), cost=column.clone(), shape=[num_envs])
-
-    def _reset(self, tensordict=None, **kwargs):
-        self.count = torch.zeros(*self.batch_size, 1)
-        return TensorDict(observation=self.count.clone(), batch_size=self.batch_size)
-
-    def _step(self, tensordict):
-        self.count = self.count + 1
-        action, done = tensordict["action"], self.count >= 3
-        return TensorDict(
-            observation=self.count.clone(),
-            reward=action.clone(),
-            cost=action.clone(),
-            done=done,
-            terminated=done.clone(),
-            batch_size=self.batch_size,
-        )
-
-    def _set_seed(self, seed):
-        pass
-
-
-def returns(transform, plans):
-    """Sum of the rewards of each plan until it is done, and of all its costs until then."""
-    env = Choices(len(plans))
-    env = env if transform is None else TransformedEnv(env, transform)
-    data, running = env.reset(), torch.ones(len(plans), 1, dtype=torch.bool)
-    total, cost = torch.zeros(2, len(plans), 1)
-    for step in range(3):
-        following = env.step(data.set("action", plans[:, step : step + 1]))["next"]
-        total = total + following["reward"] * running
-        cost = cost + following["cost"] * running
-        running = running & ~following["done"]
-        data = following.exclude("reward", "cost")
-    return total.flatten(), cost.flatten()
-
-
-@pytest.mark.parametrize("budget", [0.0, 1.0, 2.0, 3.0])
-@pytest.mark.parametrize("kind", ["saute", "early"])
-def test_the_best_plan_is_the_best_within_the_budget(kind, budget):
-    """All eight plans tried: without constraints the best costs 3."""
-    plans = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
-    best, cost = returns(None, plans)
-    assert (best.max(), cost[best.argmax()]) == (3.0, 3.0)
-    if kind == "saute":  # Which takes budgets above 0.
-        transform = Saute(max(budget, 0.1), unsafe_reward=-10.0)
-    else:
-        transform = EarlyTermination(budget, termination_reward=-10.0)
-    total, cost = returns(transform, plans)
-    chosen = total == total.max()
-    assert total.max() == budget
-    assert (cost[chosen] == budget).all()
-    assert chosen.sum() == math.comb(3, int(budget))
-
-
-# ---------------------------------------------------------------- arms
 
 
 def half(state):
@@ -513,125 +342,6 @@ def test_arms(make_env):
     assert (following["reward"][~unsafe] > -50.0).all()
 
 
-# ---------------------------------------------------------------- bad input
-
-
-SAUTE = partial(Saute, unsafe_reward=-1.0)
-
-
-@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
-@pytest.mark.parametrize(
-    "budget",
-    [float("nan"), float("inf"), -1.0, torch.tensor([1.0, -1.0]), torch.ones(2, 1)],
-    ids=["nan", "inf", "negative", "one-negative", "matrix"],
-)
-def test_wrong_budgets(transform, budget):
-    with pytest.raises(ValueError, match=r"budget must be one number or one for each cost, fin"):
-        transform(budget)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: SAUTE(0.0), r"budget must be above 0, got 0\.0"),
-        (lambda: SAUTE(torch.tensor([1.0, 0.0])), r"budget must be above 0, got tensor"),
-        (lambda: SAUTE(1.0, discount=0.0), r"discount must be above 0 and at most 1, got 0\.0"),
-        (lambda: SAUTE(1.0, discount=1.1), r"discount must be above 0 and at most 1, got 1\.1"),
-        (lambda: SAUTE(1.0, discount=True), "discount must be .* got True"),
-        (lambda: SAUTE(1.0, discount=float("nan")), "discount must be .* got nan"),
-        (lambda: Saute(1.0, unsafe_reward=float("nan")), "unsafe_reward must be finite, got nan"),
-        (
-            lambda: EarlyTermination(1.0, termination_reward=float("inf")),
-            "termination_reward must be finite, got inf",
-        ),
-    ],
-)
-def test_wrong_numbers(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
-def test_rewards_of_numpy_are_numbers():
-    assert type(Saute(1.0, unsafe_reward=np.array(-1)).unsafe_reward) is float
-    early = EarlyTermination(1.0, termination_reward=np.float64(-1))
-    assert type(early.termination_reward) is float
-
-
-@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
-@pytest.mark.parametrize("shape", [(2,), (4,)], ids=str)
-def test_there_must_be_one_budget_for_each_cost(transform, shape):
-    env = inside(partial(transform, torch.ones(shape)), 2, num_costs=3)
-    with pytest.raises(ValueError, match=rf"each of the 3 costs, got shape \({shape[0]},\)"):
-        env.observation_spec  # noqa: B018
-
-
-@pytest.mark.parametrize(
-    ("transform", "message"),
-    [
-        (partial(SAUTE, cost_key="hazard"), r"cost_key must be among the rewards .* 'hazard'"),
-        (partial(SAUTE, reward_key="r"), r"reward_key must be among the rewards .* got 'r'"),
-        (partial(SAUTE, out_key="observation"), r"out_key must not be among .* 'observation'"),
-        (
-            partial(EarlyTermination, terminated_key="over"),
-            r"terminated_key must be among the done flags .* got 'over'",
-        ),
-        (
-            partial(EarlyTermination, done_key=("agents", "done")),
-            r"done_key must be among the done flags .* got \('agents', 'done'\)",
-        ),
-    ],
-)
-def test_wrong_keys(transform, message):
-    env = inside(partial(transform, 1.0))
-    with pytest.raises(KeyError, match=message):
-        env.observation_spec  # noqa: B018
-
-
-class Team(CountingBatch):
-    """Three rows, each with as many agents, which have rewards of their own and share the cost."""
-
-    def __init__(self):
-        super().__init__(3)
-        agents = Composite(reward=Unbounded((3, 3, 1)), shape=(3, 3))
-        self.reward_spec = Composite(agents=agents, shape=(3,))
-
-
-@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
-def test_rewards_of_agents_are_refused(transform):
-    """They would be changed in one agent of each row, not in each agent of one row."""
-    env = TransformedEnv(Team(), CostToReward())
-    env.append_transform(transform(1.0, reward_key=("agents", "reward")))
-    message = r"reward_key must have shape \(3, 1\), .* got \(3, 3, 1\) for \('agents', 'reward'\)"
-    with pytest.raises(ValueError, match=message):
-        env.observation_spec  # noqa: B018
-
-
-@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
-def test_a_tally_that_no_reset_would_reach_is_refused(transform):
-    env = CountingBatch(2)
-    flag = Unbounded((2, 1), dtype=torch.bool)
-    flags = Composite({key: flag.clone() for key in env.done_keys}, shape=(2,))
-    env.done_spec = Composite(agents=flags, shape=(2,))
-    env = TransformedEnv(env, CostToReward())
-    keys = {}
-    if transform is EarlyTermination:
-        keys = {"terminated_key": ("agents", "terminated"), "done_key": ("agents", "done")}
-    env.append_transform(transform(1.0, **keys))
-    with pytest.raises(KeyError, match=r"out_key must stand beside done flags, .*\('agents',\)"):
-        env.observation_spec  # noqa: B018
-
-
-@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
-def test_is_for_environments(transform):
-    with pytest.raises(RuntimeError, match="append it to one"):
-        transform(1.0)(TensorDict())
-
-
-def test_the_base_class_needs_its_rules():
-    with pytest.raises(TypeError, match="abstract"):
-        CostTally(1.0, start=0.0, cost_key="cost", reward_key="reward", out_key="tally")
-
-
 @pytest.mark.parametrize(
     ("transform", "start"),
     [(partial(Saute, 100.0, unsafe_reward=-7.0), 1.0), (partial(EarlyTermination, 100.0), 0.0)],
@@ -642,10 +352,3 @@ def test_a_reset_without_a_mask_begins_all_tallies_anew(make_env, transform, sta
     env = make_env(inside, transform, 2)
     following = env.step(env.rand_action(env.reset()))["next"].exclude("reward", "cost")
     assert env.reset(following)[env.transform[-1].out_key].tolist() == [[start]] * 2
-
-
-def test_a_budget_is_copied():
-    budget = torch.tensor([0.5])
-    transform = EarlyTermination(budget)
-    budget.zero_()
-    assert transform.budget.tolist() == [0.5]

@@ -1,31 +1,21 @@
-"""The shield: its distances, what it does to actions, and attacks on it."""
+"""The shield: its distances and what it does to actions."""
 
-import json
-
-import attack
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from states import make_state
-from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.envs.utils import check_env_specs
 from worlds import ENGINES, Places, each_arm, step
 
 from experiments.pilots import act, make_pilot
 from torchrl_safe.envs import (
     PANDA,
-    UR5,
     ArmEnv,
     Box,
     CartesianDelta,
     Collision,
     Cylinder,
-    Human,
     InFront,
     JointDelta,
-    Moving,
     Nearest,
     NoObstacles,
     PickAndPlace,
@@ -35,13 +25,14 @@ from torchrl_safe.envs import (
     Scattered,
     Scene,
     Shield,
-    ShieldCorrection,
     Sphere,
 )
 
 # With that, a control step of 1/20 s may use up this share of the room above the margin.
 SLOW = Shield(margin=0.02, rate=5.0)
+
 SHARE = 1 - np.exp(-5 / 20)
+
 # A Cartesian action towards the table.
 DOWN = torch.tensor([0.0, 0.0, -1.0])
 
@@ -344,147 +335,6 @@ def test_the_table_is_left_alone(make_env, engine):
         assert any(costs) == (shield is None)
 
 
-@pytest.mark.parametrize("obstacles", [NoObstacles(), Scattered(fewest=0), Human()], ids=str)
-def test_specs(make_env, engine, obstacles):
-    costs = {"collision": Collision(), "shield": ShieldCorrection()}
-    env = make_env(ArmEnv, num_envs=2, obstacles=obstacles, shield=Shield(), costs=costs, seed=0)
-    check_env_specs(env)
-    first = env.reset()
-    assert not first["shield_correction"].any()
-    assert not first["shield_braked"].any()
-    rollout = env.rollout(4)["next"]
-    torch.testing.assert_close(rollout["cost"][..., 1:], rollout["shield_correction"])
-    assert rollout["shield_correction"].shape == (2, 4, 1)
-
-
-def test_two_flags_of_a_step_do_not_share_their_memory(make_env, engine):
-    env = make_env(ArmEnv, num_envs=2, shield=Shield(), max_episode_steps=1, seed=0)
-    env.reset()
-    last = step(env, torch.zeros(2, 3))
-    kept = last["success"].clone()
-    last["terminated"].logical_not_()
-    assert torch.equal(last["success"], kept)
-
-
-def test_the_batch_holds_the_sampled_action(make_env, engine):
-    """And its log-probability. What is executed instead is up to the environment."""
-    env = make_env(ArmEnv, num_envs=2, action=JointDelta(), shield=Shield(), seed=0)
-    sampled = []
-
-    def policy(tensordict):
-        action = torch.ones(2, 7) * (-1.0) ** torch.arange(7)
-        sampled.append(action)
-        return tensordict.set("action", action)
-
-    collector = Collector(env, policy, frames_per_batch=20, total_frames=20)
-    (batch,) = list(collector)
-    torch.testing.assert_close(batch["action"], torch.stack(sampled[-10:], dim=1))
-    assert batch["next", "shield_correction"].any()
-
-
-def test_checkpoints_bring_the_correction_back(make_env, engine):
-    env, other = (make_env(ArmEnv, num_envs=2, shield=Shield(), seed=0) for _ in range(2))
-    env.reset()
-    for _ in range(5):
-        step(env, DOWN)
-    assert env.arm_state.shield_correction.any()
-    other.load_state_dict(env.state_dict())
-    for name in ("shield_correction", "shield_braked", "joint_position"):
-        np.testing.assert_array_equal(getattr(env.arm_state, name), getattr(other.arm_state, name))
-    after = [step(each, DOWN)["shield_correction"] for each in (env, other)]
-    torch.testing.assert_close(*after, rtol=0, atol=0)
-
-
-def test_a_partial_reset_forgets_one_correction(make_env, engine):
-    env = make_env(ArmEnv, num_envs=2, shield=Shield(), seed=0)
-    env.reset()
-    before = [step(env, DOWN) for _ in range(5)][-1]["shield_correction"]
-    assert before.all()
-    env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
-    after = env.arm_state.shield_correction
-    assert after[0] == 0
-    assert after[1] == pytest.approx(before[1].item())
-
-
-def test_a_world_is_the_same_alone_and_among_others(make_env, engine):
-    """Bit for bit, also where its neighbours make the shield measure twice."""
-    settings = {"action": JointDelta(), "shield": Shield(), "obstacles": Moving()}
-    actions = torch.rand(12, 3, 7) * 2 - 1
-    together = make_env(ArmEnv, num_envs=3, seed=0, **settings)
-    seed, found = 0, []
-    together.reset()
-    many = [step(together, action)["observation"] for action in actions]
-    for row in range(3):
-        alone = make_env(ArmEnv, seed=seed, **settings)
-        seed = alone.set_seed(seed)
-        alone.reset()
-        found.append([step(alone, action[row])["observation"][0] for action in actions])
-    for row in range(3):
-        expected = torch.stack([observation[row] for observation in many])
-        torch.testing.assert_close(torch.stack(found[row]), expected, rtol=0, atol=0)
-
-
-def test_gymnasium_tells_what_the_shield_did():
-    env = gymnasium.make("torchrl_safe/PandaReachInFront-v0", shield=Shield())
-    env.reset(seed=0)
-    *_, info = env.step(env.action_space.sample())
-    assert info["shield_braked"] is False
-    assert info["shield_correction"] >= 0
-    env.close()
-
-
-def test_corrections_cost_what_exceeds_a_margin():
-    state = make_state(shield_correction=[0.3, 0.05])
-    np.testing.assert_allclose(ShieldCorrection()(state), [0.3, 0.05])
-    np.testing.assert_allclose(ShieldCorrection(margin=0.1)(state), [0.2, 0.0])
-
-
-def test_a_correction_needs_a_shield():
-    with pytest.raises(ValueError, match="shield must be given to ArmEnv"):
-        ArmEnv(costs={"shield": ShieldCorrection()})
-    with pytest.raises(TypeError, match="shield must be an instance of Shield"):
-        ArmEnv(shield=0.02)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"margin": -0.1},
-        {"table": float("nan")},
-        {"rate": 0.0},
-        {"reach": 0.01},
-        {"acceleration": -1.0},
-        {"tool_weight": -1.0},
-        {"obstacle_speed": -1.0},
-    ],
-    ids=lambda settings: next(iter(settings)),
-)
-def test_bad_shields_are_refused(settings):
-    (name,) = settings
-    with pytest.raises(ValueError, match=name):
-        Shield(**settings)
-
-
-@pytest.mark.parametrize("kind", attack.ATTACKS)
-@pytest.mark.parametrize("action", attack.ACTIONS)
-def test_no_attack_makes_it_touch_what_stands(make_env, engine, action, kind):
-    env = make_env(
-        attack.make, PANDA, attack.ACTIONS[action], InFront(), ENGINES[engine], 8, seed=1
-    )
-    tally = attack.play(env, attack.ATTACKS[kind], 25)
-    assert tally.steps == 200
-    assert tally.touches == tally.table == 0
-
-
-def test_what_the_next_step_needs_is_looked_at(make_env):
-    """A stretched arm along the table, joints at full speed against each other: it sank to it."""
-    env = make_env(
-        attack.make, UR5, attack.ACTIONS["cartesian"], InFront(), ENGINES["mujoco"], 32, seed=119
-    )
-    tally = attack.play(env, attack.corners, 20, seed=19)
-    assert tally.touches == tally.table == 0, str(tally)
-
-
 @pytest.mark.parametrize(
     ("task", "obstacles"),
     [(Push(), NoObstacles()), (PickAndPlace(on_table=1.0), InFront())],
@@ -509,78 +359,6 @@ def test_it_lets_an_arm_push_and_pick_up(make_env, task, obstacles):
         success = success + (after["success"] & alive)
         alive &= ~after["done"]
     assert success.all()
-
-
-def test_attacks_go_on_where_they_were_stopped(tmp_path, monkeypatch, capsys):
-    out, played = tmp_path / "attack.json", []
-    play = attack.play
-    monkeypatch.setattr(attack, "play", lambda *a: played.append(a[1].__name__) or play(*a))
-    options = ["--steps", "24", "--envs", "2", "--arms", "Panda", "--layouts", "in-front"]
-    monkeypatch.setattr("sys.argv", ["attack.py", *options, "--out", str(out)])
-    attack.main()
-    assert played == [*attack.ATTACKS] * 2
-    text = capsys.readouterr().out
-    assert "all: 24 steps" in text
-    kept = json.loads(out.read_text())
-    kept.pop(next(iter(kept)))
-    out.write_text(json.dumps(kept))
-    attack.main()
-    assert played[6:] == ["random"]
-    assert capsys.readouterr().out == text
-
-
-def test_the_attacks_would_touch_it_else(make_env):
-    """Without the shield's rows: margins and rates that allow everything."""
-    lax = Shield(margin=0.0, table=0.0, rate=1e6, acceleration=1e6)
-    settings = {"shield": lax, "seed": 1}
-    action, physics = attack.ACTIONS["cartesian"], ENGINES["mujoco"]
-    env = make_env(attack.make, PANDA, action, InFront(), physics, 8, **settings)
-    assert attack.play(env, attack.greedy, 25).touches > 0
-
-
-@pytest.mark.slow
-@each_arm
-@pytest.mark.parametrize("layout", attack.FIXED)
-@pytest.mark.parametrize("action", attack.ACTIONS)
-def test_no_long_attack_makes_any_arm_touch_what_stands(make_env, engine, arm, action, layout):
-    physics = ENGINES[engine]
-    for kind in attack.ATTACKS:
-        env = make_env(
-            attack.make, arm, attack.ACTIONS[action], attack.FIXED[layout], physics, 16, seed=2
-        )
-        tally = attack.play(env, attack.ATTACKS[kind], 100)
-        assert tally.touches == tally.table == 0, f"{kind}: {tally}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("layout", attack.MOVING)
-@pytest.mark.parametrize("action", attack.ACTIONS)
-def test_the_arm_never_moves_into_what_moves(make_env, engine, action, layout):
-    """A person may move into it, and press it onto the table."""
-    for kind in attack.ATTACKS:
-        env = make_env(
-            attack.make,
-            PANDA,
-            attack.ACTIONS[action],
-            attack.MOVING[layout],
-            ENGINES[engine],
-            16,
-            seed=3,
-        )
-        tally = attack.play(env, attack.ATTACKS[kind], 100)
-        assert tally.own == 0, f"{kind}: {tally}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("action", attack.ACTIONS)
-def test_no_sequence_that_is_searched_for_touches(make_env, action):
-    """By the cross-entropy method, with all episodes alike."""
-    layout = Places(Cylinder(), at=[(0.5, 0.05, 0.1)])
-    physics = ENGINES["mujoco"]
-    env = make_env(attack.make, PANDA, attack.ACTIONS[action], layout, physics, 32)
-    tally = attack.evolve(env, generations=20, length=20)
-    assert tally.touches == tally.table == 0, str(tally)
-    assert tally.nearest < 0.05
 
 
 class _Fist:
