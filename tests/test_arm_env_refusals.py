@@ -217,12 +217,22 @@ def test_fields_of_an_observation_stay_as_they_were(make_env, later, message):
         env.step(start.set("action", torch.zeros(1, 3)))
 
 
-@pytest.mark.parametrize("name", ["joint_lower", "joint_upper", "obstacle_size"])
-def test_what_a_state_shares_with_the_simulator_cannot_be_changed(make_env, name):
+@pytest.mark.usefixtures("engine")
+@pytest.mark.parametrize("name", ["joint_lower", "obstacle_size", "goal", "joint_position"])
+def test_a_state_cannot_be_changed(make_env, name):
+    """Costs, tasks, observations and motors share its arrays."""
     env = make_env(ArmEnv, seed=0)
     env.reset()
     with pytest.raises(ValueError, match="read-only"):
         getattr(env.arm_state, name)[:] = 0
+
+
+def test_a_mask_of_worlds_to_step_is_refused(make_env):
+    env = make_env(ArmEnv, num_envs=2, seed=0)
+    start = env.reset().set("action", torch.ones(2, 3))
+    env.step(start.clone().set("_step", torch.tensor([True, True])))
+    with pytest.raises(RuntimeError, match="all of its worlds together, but '_step' leaves some"):
+        env.step(start.set("_step", torch.tensor([True, False])))
 
 
 def test_a_reset_takes_no_seed(make_env):

@@ -255,6 +255,9 @@ def test_bad_mount_is_named(name):
     ("changes", "error", "message"),
     [
         ({"urdf": 3}, TypeError, "urdf must be an instance of str, got 3"),
+        ({"home": 0.0}, ValueError, r"home must have shape \(1,\)"),
+        ({"home": ((0.0,),)}, ValueError, r"home must have shape \(1,\)"),
+        ({"home": ("0",)}, ValueError, "home must be"),
         ({"ee_link": None}, TypeError, "ee_link must be an instance of str, got None"),
         ({"goals": ((0, 0, 0), (1, 1, 1))}, TypeError, "goals must be an instance of Region"),
         ({"gripper": "gripper.urdf"}, TypeError, "gripper must be an instance of Gripper"),
@@ -273,6 +276,23 @@ def test_free_fingers_begin_within_their_limits(physics):
     with pytest.raises(ValueError, match=r"finger_home must be within .*, got 0\.5"):
         physics.build(arm, Scene(free_fingers=True), num_envs=1)
     physics.build(arm, Scene(), num_envs=1).close()  # They are fixed.
+
+
+def test_a_home_pose_may_be_a_tensor():
+    assert dataclasses.replace(PANDA, home=torch.tensor(PANDA.home, dtype=torch.float64)) == PANDA
+
+
+@pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
+def test_fingers_must_open_alike(tmp_path, physics):
+    """With axes that point the same way, equal motor targets would move the hand, not open it."""
+    path = tmp_path / "mirrored.urdf"
+    text = find_urdf("gripper.urdf").read_text()
+    mirrored = 'lower="-0.04" upper="0"'
+    path.write_text(mirrored.join(text.rsplit('lower="0" upper="0.04"', 1)))
+    assert mirrored in path.read_text()
+    arm = dataclasses.replace(UR5, gripper=Gripper(str(path), "tool"))
+    with pytest.raises(ValueError, match=r"gripper must have fingers that all open by the same"):
+        physics.build(arm, Scene(free_fingers=True), num_envs=1)
 
 
 def test_tool_must_be_moved_by_a_joint():

@@ -92,6 +92,21 @@ def test_unreadable_file_is_named(tmp_path, content):
         prepare_urdf(arm(path, "tool"), visuals=False, fix_fingers=True, merge=False)
 
 
+def test_another_format_is_named(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(ValueError, match=r"urdf must be a URDF file, .*arm.xml': <mujoco>"):
+        prepare_urdf(arm(path, "tool"), visuals=False, fix_fingers=True, merge=False)
+
+
+def test_a_slide_without_a_range_is_free(tmp_path):
+    """PyBullet would lock it."""
+    slide = joint(1, kind="prismatic", limit='lower="0" upper="0"')
+    path = make_urdf(tmp_path / "arm.urdf", link("l0"), link("l1"), slide)
+    text, _, _ = prepare_urdf(arm(path, "l1"), visuals=False, fix_fingers=True, merge=False)
+    assert ElementTree.fromstring(text).find("joint/limit").keys() == ["effort", "velocity"]
+
+
 def test_missing_mesh_is_named(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(
@@ -155,6 +170,13 @@ def test_urdf_is_found_by_its_path_or_in_the_packages(tmp_path):
     assert find_urdf(PANDA.urdf) == data / "franka_panda" / "panda.urdf"
     assert find_urdf("gripper.urdf").parent.name == "arms"
     assert find_urdf("ur_description/urdf/ur5_robot.urdf").is_file()
+
+
+def test_a_name_of_two_files_is_refused(tmp_path, monkeypatch):
+    make_urdf(tmp_path / "gripper.urdf")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"urdf must be the path of one file, got 'gripper.urdf'"):
+        find_urdf("gripper.urdf")
 
 
 @pytest.mark.parametrize("name", ["", "gone.urdf", "/gone.urdf"])
@@ -320,8 +342,9 @@ def make_chain(make_env, tmp_path):
         (joint(2, axis="0 2 0"), (-3.0, 3.0)),
         (joint(2, limit='lower="0" upper="0"'), (-np.inf, np.inf)),
         (joint(2, kind="continuous", limit='lower="-1" upper="1"'), (-np.inf, np.inf)),
+        (joint(2) + "<mujoco><compiler discardvisual='true'/></mujoco>", (-3.0, 3.0)),
     ],
-    ids=["long-axis", "no-range", "continuous-with-range"],
+    ids=["long-axis", "no-range", "continuous-with-range", "with-mujoco's-own-element"],
 )
 def test_both_engines_read_joints_alike(make_chain, second, limits):
     """And each joint goes where it is sent."""

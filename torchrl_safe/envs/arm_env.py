@@ -303,6 +303,12 @@ class ArmEnv(EnvBase):
         self._check_open()
         if not self._begun:
             raise RuntimeError("ArmEnv must be reset before its first step.")
+        mask = tensordict.get("_step", None)
+        if mask is not None and not mask.all():
+            raise RuntimeError(
+                "ArmEnv steps all of its worlds together, but '_step' leaves some out, as "
+                "MultiAction and ConditionalSkip do: put single ones in a SerialEnv."
+            )
         action = self._check_action(tensordict["action"])
         joints, fingers = self._targets(action)
         if self.scene.motor_limits:
@@ -512,11 +518,15 @@ class ArmEnv(EnvBase):
 
     def _read_state(self) -> ArmState:
         state = self._simulator.state()
-        if self.shield is None:
-            return state
-        return replace(
-            state, shield_correction=self._correction.copy(), shield_braked=self._braked.copy()
-        )
+        if self.shield is not None:
+            state = replace(
+                state, shield_correction=self._correction.copy(), shield_braked=self._braked.copy()
+            )
+        # Costs, tasks and observations share the arrays: what one writes, the others would read.
+        for array in [*vars(state).values(), *state.trace.values()]:
+            if isinstance(array, np.ndarray):
+                array.setflags(write=False)
+        return state
 
     def _observe(self, state: ArmState) -> Array:
         fields = self.observation(state)

@@ -57,8 +57,8 @@ class ArmModel:
         home: joint angles at the start of an episode, in radians, one for each joint of the
             arm. Cartesian actions keep the tool orientation of this pose.
         goals: box in which the arm reaches every point with the tool turned as at home, in the
-            frame of the arm's base, m. Defaults to the Panda's: x from 0.6 to 0.7, y from -0.2 to
-            0.2, z from 0.05 to 0.15.
+            world, where the URDF's root link is at the origin, m. Defaults to the Panda's: x from
+            0.6 to 0.7, y from -0.2 to 0.2, z from 0.05 to 0.15.
         finger_home: position of free finger joints at the start of an episode, m.
         gripper: what is mounted on ``ee_link``; its ``tool_link`` then is the tool point.
         handling_orientation: tool orientation, a quaternion (x, y, z, w), that keeps the arm off
@@ -87,6 +87,7 @@ class ArmModel:
     def __post_init__(self) -> None:
         check_kind("urdf", self.urdf, str)
         check_kind("ee_link", self.ee_link, str)
+        keep_numbers(self, "home", math.prod(np.shape(self.home)))
         check_kind("goals", self.goals, Region)
         check_array("finger_home", self.finger_home, ())
         if self.gripper is not None:
@@ -109,13 +110,16 @@ def check_home(arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.floa
         )
 
 
-def check_finger_home(
-    arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.float64]
-) -> None:
-    """Raises ValueError unless free fingers begin within their limits, m, ``(f,)``.
+def check_fingers(arm: ArmModel, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> None:
+    """Raises ValueError unless free fingers have one range, m, ``(f,)``, and begin within it.
 
     Not for motors without limits: the paper's arm begins beyond them.
     """
+    if len(np.unique(lower)) > 1 or len(np.unique(upper)) > 1:
+        raise ValueError(
+            "gripper must have fingers that all open by the same amount, along axes that point "
+            f"apart, got limits of {lower.tolist()} and {upper.tolist()}."
+        )
     if not np.all((lower <= arm.finger_home) & (arm.finger_home <= upper)):
         raise ValueError(
             f"finger_home must be within the limits of the fingers, {lower.tolist()} and "

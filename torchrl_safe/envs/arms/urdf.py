@@ -74,12 +74,17 @@ def find_urdf(name: str) -> Path:
             directory.
 
     Raises:
-        ValueError: if there is no such file.
+        ValueError: if there is no such file, or several.
     """
-    for folder in _folders():
-        # An absolute name takes the place of the folder.
-        if (folder / name).is_file():
-            return folder / name
+    # An absolute name takes the place of the folder.
+    found = {path.resolve(): path for folder in _folders() if (path := folder / name).is_file()}
+    if len(found) > 1:
+        raise ValueError(
+            f"urdf must be the path of one file, got {name!r}, which is in several folders: pass "
+            f"one of {[str(path) for path in found]}."
+        )
+    if found:
+        return found.popitem()[1]
     hint = f"there is no such file in any of {[str(folder) for folder in _folders()]}"
     if str(name).partition("/")[0].endswith("_description"):
         hint += f'; the arms of {_MORE_ARMS} need `pip install "torchrl-safe[more-arms]"`'
@@ -123,6 +128,10 @@ def _read(name: str, *, visuals: bool) -> ElementTree.Element:
         raise ValueError(
             f"urdf must be a readable URDF file, got {str(path)!r}: {error}"
         ) from error
+    if root.tag != "robot":
+        raise ValueError(
+            f"urdf must be a URDF file, whose root is <robot>, got {str(path)!r}: <{root.tag}>."
+        )
     if not visuals:
         for link in root.iter("link"):
             for visual in link.findall("visual"):
@@ -146,11 +155,12 @@ def _settle(joint: ElementTree.Element) -> None:
         if length != 1:
             axis.set("xyz", " ".join(str(value / length) for value in values))
     limit = joint.find("limit")
-    if limit is None or joint.get("type") not in ("revolute", "continuous"):
+    if limit is None:
         return
-    if float(limit.get("lower", 0)) >= float(limit.get("upper", 0)):
+    free = float(limit.get("lower", 0)) >= float(limit.get("upper", 0))
+    if free and joint.get("type") == "revolute":
         joint.set("type", "continuous")
-    if joint.get("type") == "continuous":
+    if free or joint.get("type") == "continuous":
         for name in ("lower", "upper"):
             limit.attrib.pop(name, None)
 

@@ -337,7 +337,7 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
     @property
     def lib(self) -> Any:
         # All that TorchRL 0.14.1 takes from it is `make`.
-        return SimpleNamespace(make=partial(_make, self._maker.make))
+        return SimpleNamespace(make=partial(_make, self._maker))
 
     def _build_env(self, env_name: str, **kwargs: Any) -> Any:
         self._maker, name = safety_gymnasium.find_maker(env_name)
@@ -345,7 +345,7 @@ class SafeGymEnv(_CostBesideReward, GymEnv):
 
     def _async_env(self, factories: Sequence[Callable[[], gymnasium.Env]]) -> Any:
         # TorchRL calls it for any number of environments, also for those of this process.
-        maker = autoreset if self._maker is gymnasium else safety_gymnasium
+        maker = autoreset if self._maker is gymnasium.make else safety_gymnasium
         factories = [partial(_make_with_floats, make, self._cost_paths) for make in factories]
         return maker.vector_env(factories, asynchronous=self._asynchronous)
 

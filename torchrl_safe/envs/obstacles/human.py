@@ -43,8 +43,8 @@ class Human:
     Args:
         shoulder: position of the shoulder, m.
         rest: position of the hand between two reaches, m.
-        duration: shortest and longest time of a reach, s; as long again for the way back. The
-            largest speed of the hand is 1.875 times distance over duration.
+        duration: shortest and longest time of a reach, s; the way back has such a time of its
+            own. The largest speed of the hand is 1.875 times distance over duration.
         pause: shortest and longest wait before and after a reach, s.
 
     Raises:

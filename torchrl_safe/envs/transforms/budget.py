@@ -141,7 +141,10 @@ class CostTally(Transform, abc.ABC):
                 f"{self.out_key!r} must come from the step before, and is missing: a transform "
                 "that uses it must keep it (CatTensors with del_keys=False)."
             )
-        tally = self.advance(before, next_tensordict.get(self.cost_key).to(before))
+        cost = next_tensordict.get(self.cost_key).to(before)
+        if cost.isnan().any():  # No tally that is NaN ever exceeds a budget.
+            raise ValueError(f"{self.cost_key!r} must be numbers, got NaN: {cost}.")
+        tally = self.advance(before, cost)
         next_tensordict.set(self.out_key, tally)
         return self.enforce(next_tensordict, self.is_spent(tally).any(-1, keepdim=True))
 

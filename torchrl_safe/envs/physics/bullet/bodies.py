@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.arms.models import check_finger_home, check_home
+from torchrl_safe.envs.arms.models import check_fingers, check_home
 from torchrl_safe.envs.arms.urdf import prepare_urdf
 from torchrl_safe.envs.obstacles.shapes import Box, Capsule, Cylinder, Part, Shape, Sphere
 from torchrl_safe.envs.physics.bullet.engine import pybullet, pybullet_data
@@ -109,7 +109,7 @@ def load_arm(
     loaded = _find_joints(client, body, chain, tool_link)
     check_home(arm, loaded.joint_lower, loaded.joint_upper)
     if scene.motor_limits:
-        check_finger_home(arm, loaded.finger_lower, loaded.finger_upper)
+        check_fingers(arm, loaded.finger_lower, loaded.finger_upper)
         _couple(client, body, loaded.fingers)
     return loaded
 

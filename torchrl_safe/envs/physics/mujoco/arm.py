@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_safe.envs.arms import ArmModel
-from torchrl_safe.envs.arms.models import check_finger_home, check_home
+from torchrl_safe.envs.arms.models import check_fingers, check_home
 from torchrl_safe.envs.arms.urdf import prepare_urdf
 from torchrl_safe.envs.physics.mujoco.contacts import collides, set_arm_contacts
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
@@ -76,6 +76,8 @@ def read_arm(
     root = ElementTree.fromstring(text)
     _rename_world(root)
     meshes = read_meshes(root)
+    for own in root.findall("mujoco"):  # MuJoCo takes one.
+        root.remove(own)
     extension = ElementTree.SubElement(root, "mujoco")
     ElementTree.SubElement(extension, "compiler", _COMPILER, discardvisual=str(not visuals).lower())
     try:
@@ -87,7 +89,7 @@ def read_arm(
     check_home(arm, parts.joint_lower, parts.joint_upper)
     _free_joints(spec, parts)
     if couple:
-        check_finger_home(arm, parts.finger_lower, parts.finger_upper)
+        check_fingers(arm, parts.finger_lower, parts.finger_upper)
         _couple(spec, parts.fingers)
     else:
         for gear in list(spec.equalities):

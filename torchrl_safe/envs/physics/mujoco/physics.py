@@ -54,7 +54,10 @@ class MuJoCo:
     ) -> MuJoCoSimulator:
         """Builds the worlds of an environment."""
         if gui:
-            raise ValueError("gui must be False with MuJoCo, which has no window here: use render.")
+            raise ValueError(
+                "gui must be False and render_mode not 'human' with MuJoCo, which has no window "
+                "here: use render."
+            )
         mujoco.MjSpec  # noqa: B018  (says so if it is missing)
         return MuJoCoSimulator(
             arm,
