@@ -163,8 +163,8 @@ COST_LIMIT = 0.5
 runs = {"PPO": train(), "PPO-Lagrangian": train(COST_LIMIT)}
 
 # %%
-# Both learn to reach the target. Only one learns to do so without contact. Its multiplier rises
-# while the limit is exceeded and settles when it is kept.
+# Both learn to reach the target. Only one learns to do so without contact. Its multiplier
+# rises when the limit is exceeded and settles when it is kept.
 
 COLOURS = {"PPO": "tab:orange", "PPO-Lagrangian": "tab:blue"}
 frames = torch.arange(1, FRAMES // FRAMES_PER_BATCH + 1) * FRAMES_PER_BATCH
@@ -239,7 +239,7 @@ figure.tight_layout()
 # - Train longer: with ``FRAMES = 128_000`` the policy is smoother and the limit is kept more
 #   surely. ``make train`` does that, and lowers the noise of the policy along the way.
 # - `The same loop, step by step <own_loop.html>`_, with every tensor that goes through it.
-# - `Choose a limit, a discount and a rate <../howto/limit.html>`_, `the cost stays just above the
-#   limit <../howto/just_above.html>`_.
+# - `Choose a limit and a discount <../howto/limit.html>`_, `The cost sits just above the limit
+#   <../howto/just_above.html>`_.
 # - Reference: `environments <../reference/environments.html>`_, `losses
 #   <../reference/on_policy.html>`_, `rules <../reference/rules.html>`_.

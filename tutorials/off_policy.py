@@ -54,8 +54,8 @@ width, actions = observation.shape[-1], env.action_spec.shape[-1]
 # ---------------------------
 #
 # The actor chooses mean and deviation in every state. The critics read the action too: one
-# predicts the reward, one the costs, with an output for each. The loss makes two copies of each.
-# Of two predictions it believes the smaller reward and the larger cost.
+# predicts the reward, one the costs, with an output for each. The loss trains two copies of
+# each. It uses the smaller reward prediction and the larger cost prediction.
 
 
 class Network(nn.Module):
@@ -89,9 +89,9 @@ cost_critic = ValueOperator(
 # ``SACLagrangianLoss`` is TorchRL's ``SACLoss`` with limits. It compares values, not standardized
 # advantages, so here the multiplier has a unit: reward per cost. An episode earns about -2 if it
 # succeeds and -8 if it does not (metres times steps), so a contact may cost about 1. The gains of
-# the rule have the same unit. They are smaller than the defaults, which suit PPO: with those, the
-# price of a contact soon exceeds everything there is to earn. The entropy bonus starts small for
-# the same reason.
+# the rule have the same unit. They are smaller than the defaults: in a run as short as this one,
+# the price of a contact would soon exceed everything there is to earn. The entropy bonus starts
+# small for the same reason.
 
 loss = SACLagrangianLoss(
     actor, critic, cost_critic, action_spec=env.action_spec_unbatched, alpha_init=0.05

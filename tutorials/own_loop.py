@@ -68,9 +68,10 @@ print(int(ended.sum()), "episodes ended, mean cost", round(episode_cost.mean().i
 # --------------------
 #
 # The actor is that of any PPO. Beside the critic of the reward there is one of the costs, with an
-# output for each. Two details make them learn faster. They standardize observations, by
-# the random ones from above: goals differ by centimetres, velocities by metres a second. And the
-# critics predict the mean of a step; a value is about ``1 / (1 - GAMMA)`` times as much.
+# output for each. Two details make them learn faster. All networks standardize observations with
+# the statistics of the random rollout above, because goals differ by centimetres and velocities by
+# metres a second. And the critics predict the mean of a step; a value is about ``1 / (1 - GAMMA)``
+# times as much.
 
 observations = rollout["observation"].flatten(0, 1)
 GAMMA = 0.97
@@ -215,7 +216,7 @@ for batch in batches:
 # 7. What happened
 # ----------------
 #
-# The multiplier goes up while the cost is above the limit, and comes down when the limit is kept.
+# The multiplier goes up at first, when the cost is above the limit, and comes down with the cost.
 # What is left of it is the price at which the policy keeps the limit.
 
 success, cost, multiplier = torch.tensor(history).T

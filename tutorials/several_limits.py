@@ -151,7 +151,7 @@ runs = {name: train(limits) for name, limits in LIMITS.items()}
 # A multiplier for each
 # ---------------------
 #
-# Each cost has a multiplier of its own. It rises while its limit is exceeded. One that ends at 0
+# Each cost has a multiplier of its own. It rises when its limit is exceeded. One that ends at 0
 # belongs to a limit that does not bind.
 
 COLOURS = {"one limit": "tab:orange", "two limits": "tab:blue"}
