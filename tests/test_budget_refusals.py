@@ -141,6 +141,15 @@ def test_costs_that_are_nan_are_refused(make_env, transform):
         env.step(env.rand_action(env.reset()))
 
 
+@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
+def test_rewards_that_are_whole_numbers_are_refused(make_env, transform):
+    env = make_env(CountingBatch, costs={"cost_0": ()})
+    env.reward_spec = Unbounded((1,), dtype=torch.int64)
+    env = TransformedEnv(env, CostToReward(["cost_0"])).append_transform(transform(3.0))
+    with pytest.raises(ValueError, match=r"reward_key must be of floating-point numbers, got tor"):
+        env.reward_spec  # noqa: B018
+
+
 def test_the_base_class_needs_its_rules():
     with pytest.raises(TypeError, match="abstract"):
         CostTally(1.0, start=0.0, cost_key="cost", reward_key="reward", out_key="tally")

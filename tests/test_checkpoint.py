@@ -7,6 +7,7 @@ import warnings
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import NonTensorData, TensorDict
@@ -234,6 +235,18 @@ def test_an_error_of_a_component_is_its_own(run, net):
     with pytest.raises(RuntimeError, match=r"^This arm is closed\.$"):
         other.save(2)
     assert run.load() == 1
+
+
+def test_what_could_not_be_loaded_is_not_saved(run, net):
+    """Its place in the state is named: load takes no classes of others."""
+    optimizer = torch.optim.SGD(net.parameters(), lr=0.1)
+    other = RunCheckpoints(run.folder, {"optimizer": optimizer})
+    other.save(1)
+    optimizer.param_groups[0]["lr"] = np.linspace(0.1, 0, 2)[1]
+    where = r"components\['optimizer'\]\.state_dict\(\)\['param_groups'\]\[0\]\['lr'\]"
+    with pytest.raises(TypeError, match=rf"{where} must be .* of <class 'numpy.float64'>"):
+        other.save(2)
+    assert other.load() == 1
 
 
 def test_what_a_killed_process_left_is_cleared_away(run, net):

@@ -172,6 +172,13 @@ def test_the_sums_are_enough():
     torch.testing.assert_close(episodes["episode_cost"], episodes["steps"].float().expand(20, 2))
 
 
+def test_done_flags_in_a_group_are_refused():
+    """Of several agents, which of them end an episode?"""
+    env = counting(RenameTransform(["done"], [("agent", "done")]))
+    with pytest.raises(ValueError, match="env must have the key 'done', got "):
+        evaluate(env, STILL, 2, seed=0)
+
+
 def test_an_environment_comes_first(make_env):
     env = make_env(ArmEnv)
     policy = RandomPolicy(env.action_spec)

@@ -108,8 +108,14 @@ def test_cup_does_not_project_before_the_start_of_a_projection():
     data = estimated(loss)
     with pytest.raises(RuntimeError, match="Call start_projection before projection_loss"):
         loss.projection_loss(data)
+    other = build(CUPLoss, seed=3)
+    other.load_state_dict(loss.state_dict())
+    with pytest.raises(RuntimeError, match="Call start_projection before projection_loss"):
+        other.projection_loss(data)
     loss.start_projection()
     assert loss.projection_loss(data)["kl"] == 0
+    other.load_state_dict(loss.state_dict())
+    assert other.projection_loss(data)["kl"] == 0
 
 
 def test_cup_projection_leads_back_to_the_improved_policy():

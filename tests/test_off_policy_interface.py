@@ -17,7 +17,9 @@ from off_policy import (
     parameters,
 )
 from programs import run_code
+from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.modules import MLP
 from torchrl.objectives import SoftUpdate
 
 from torchrl_safe.objectives import (
@@ -213,6 +215,18 @@ def test_the_discount_of_the_costs_goes_with_the_state(kind):
     saved.make_cost_value_estimator(gamma=0.5)
     loaded.load_state_dict(saved.state_dict(), strict=True)
     assert loaded.cost_value_estimator.gamma.item() == 0.5
+
+
+@each_loss
+def test_cost_critics_may_have_dropout(kind):
+    """Also where those of the reward have none."""
+    critic = make_cost_critic(2)
+    net = MLP(out_features=2, num_cells=[8], dropout=0.5)
+    net(*(make_transitions(2)[key] for key in critic.in_keys))  # It gets its shapes.
+    critic = TensorDictModule(net, critic.in_keys, critic.out_keys)
+    loss = kind(make_actor(kind), make_q_critic(), critic, num_costs=2, **OWN[kind])
+    SoftUpdate(loss, tau=0.1)  # TorchRL warns without.
+    assert call(loss, make_transitions(2))["loss_cost_qvalue"].isfinite()
 
 
 @each_loss

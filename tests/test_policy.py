@@ -26,6 +26,7 @@ from torchrl.modules import (
     OneHotCategorical,
     ProbabilisticActor,
     QValueActor,
+    TanhDelta,
     TanhNormal,
     TruncatedNormal,
     ValueOperator,
@@ -128,6 +129,11 @@ ACTORS = {
     "deterministic": lambda: deterministic(mlp(3, torch.nn.Tanh())),
     "with-noise": lambda: TensorDictSequential(
         deterministic(mlp()), AdditiveGaussianModule(Bounded(-1, 1, (3,)))
+    ),
+    "tanh-delta": lambda: ProbabilisticActor(
+        TensorDictModule(mlp(), ["observation"], ["param"]),
+        in_keys=["param"],
+        distribution_class=TanhDelta,
     ),
     "normalized": lambda: TensorDictSequential(
         ObservationNorm(0.5, 2.0, in_keys=["observation"]), gaussian()

@@ -300,6 +300,32 @@ def test_masked_steps_do_not_count():
         torch.testing.assert_close(losses[key], expected[key])
 
 
+def test_what_does_not_count_may_be_nan():
+    """Its losses are 0, and 0 times NaN would be NaN in the gradients."""
+    loss = make_loss(2, multiplier_init=1.0)
+    batch = make_batch(2)
+    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
+    mask[0, 4:] = False
+    batch["collector", "mask"] = mask
+    batch["next", "cost"][0, 4:] = torch.nan
+    losses = loss(loss.estimate_advantages(batch).reshape(-1))
+    sum(losses[key] for key in TRAINS).backward()
+    gradients = [p.grad for p in loss.parameters() if p.grad is not None]
+    assert gradients
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+def test_reward_and_costs_have_one_dimension_of_time():
+    loss = make_loss(2)
+    loss.make_value_estimator(time_dim=0)
+    batch = make_batch(2)
+    batch.names = None
+    with pytest.raises(ValueError, match=r"time_dim must be the same .* costs, got 0 and 1: pass"):
+        loss.estimate_advantages(batch)
+    loss.make_cost_value_estimator(time_dim=-2)
+    loss.estimate_advantages(batch)
+
+
 @pytest.mark.parametrize("key", [("collector", "mask"), "mine"], ids=str)
 def test_advantages_are_those_of_the_steps_that_count(key):
     """A padded row gives the others what they have without it, up to the rounding of sums."""

@@ -8,6 +8,7 @@ import torch
 from on_policy import (
     NETWORKS,
     TRAINS,
+    around,
     assert_close_outputs,
     assert_same_outputs,
     estimated,
@@ -21,7 +22,13 @@ from tensordict.utils import unravel_key
 from torch import nn
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives import DualAscent, PPOLagrangianLoss, penalized_advantage
+from torchrl_safe.objectives import (
+    CostGAE,
+    DualAscent,
+    LagrangianLoss,
+    PPOLagrangianLoss,
+    penalized_advantage,
+)
 from torchrl_safe.testing import check_state_dict, make_batch, make_critic, make_networks
 
 # ---------------------------------------------------------------- data that do not fit
@@ -223,6 +230,16 @@ def test_a_copy_is_independent(used):
     twin.lagrange_multiplier.fill_(1.0)
     assert loss.lagrange_multiplier.tolist() == [0.0, 0.0]
     assert twin.state_dict().keys() == loss.state_dict().keys()
+
+
+@pytest.mark.parametrize("name", ["value_estimator", "cost_value_estimator"])
+@pytest.mark.parametrize(
+    "make", [PPOLagrangianLoss, around(LagrangianLoss, ClipPPOLoss)], ids=["own", "wrapped"]
+)
+def test_estimators_are_not_assigned(make, name):
+    loss = make(*make_networks())
+    with pytest.raises(AttributeError, match=f"{name} cannot be assigned: pass it to make_{name}"):
+        setattr(loss, name, CostGAE(gamma=0.5, lmbda=0.5, value_network=None))
 
 
 def test_networks_are_functional_like_those_of_clip_ppo():

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import warnings
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
+import torch
+from torch import Tensor
 from torchrl.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -20,6 +25,8 @@ from torchrl.checkpoint import (
 
 from torchrl_safe._checks import check_kind, is_number
 from torchrl_safe._files import UNFINISHED, publish
+
+_PLAIN = (bool, int, float, str, type(None))
 
 
 class RunCheckpoints:
@@ -98,6 +105,8 @@ class RunCheckpoints:
             The file.
 
         Raises:
+            TypeError: if a state has an object that :meth:`load` could not read, such as a number
+                of NumPy.
             ValueError: if ``step`` is not a whole number of at most twelve digits, ``score`` is no
                 number, or the folder has a checkpoint of a later step, or one of this step that
                 another run has left.
@@ -122,6 +131,8 @@ class RunCheckpoints:
             )
         parts = self._checkpoint.components
         taken = {name: _Taken(part.state_dict()) for name, part in parts.items()}
+        for name, part in taken.items():
+            _check_loadable(f"components[{name!r}].state_dict()", part.state)
         scores = {} if score is None else {"score": score}
         metadata = {"settings": self.settings, **scores}
         unfinished = self.folder / UNFINISHED
@@ -212,6 +223,30 @@ class _Taken:
 
     def state_dict(self) -> Any:
         return self.state
+
+
+def _check_loadable(name: str, state: Any) -> None:
+    """Raises TypeError unless ``load`` can read a state: it takes no foreign classes."""
+    if isinstance(state, Tensor) or type(state) in _PLAIN:
+        return
+    if type(state) in (dict, OrderedDict):
+        for key, value in state.items():
+            _check_loadable(f"a key of {name}", key)
+            _check_loadable(f"{name}[{key!r}]", value)
+    elif type(state) in (list, tuple):
+        for index, value in enumerate(state):
+            _check_loadable(f"{name}[{index}]", value)
+    else:
+        file = io.BytesIO()
+        torch.save(state, file)
+        file.seek(0)
+        try:
+            torch.load(file, weights_only=True)
+        except UnpicklingError as error:
+            raise TypeError(
+                f"{name} must be a tensor or a plain value, or load() could not read it, got "
+                f"{state!r} of {type(state)}: keep it as a number, a string or a tensor."
+            ) from error
 
 
 def _checkpoint_of(components: Mapping[str, Any]) -> Checkpoint:

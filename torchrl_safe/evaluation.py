@@ -64,8 +64,8 @@ def evaluate(
     Raises:
         TypeError: if ``env`` is no environment, ``policy`` cannot be called, or
             ``exploration_type`` is none.
-        ValueError: if the environment has no cost or no reward, or an episode has not ended after
-            ``max_steps``.
+        ValueError: if the environment has no cost, reward or ``done``, or an episode has not ended
+            after ``max_steps``.
 
     Examples:
         >>> from torchrl.envs.utils import RandomPolicy
@@ -101,6 +101,9 @@ def evaluate(
                 f"episode_{name} must be numbers, got {spec.dtype}: make the environment's {name} "
                 "a float, a sum of flags is a flag."
             )
+    flags = [*env.full_done_spec.keys(True, True)]
+    if "done" not in flags:
+        raise ValueError(f"env must have the key 'done', got {flags}.")
     rounds = []
     with set_exploration_type(exploration_type), _in_evaluation_mode(policy):
         for _ in range(math.ceil(episodes / env.batch_size.numel())):

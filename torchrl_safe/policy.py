@@ -17,11 +17,16 @@ from typing import IO, Any
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import TanhDelta
 
 from torchrl_safe._checks import check_kind
 from torchrl_safe._files import writing
@@ -224,6 +229,10 @@ def save_policy(
             f"actor cannot be copied: {error}. Of a transform that an environment uses, put a "
             "clone() into the actor."
         ) from error
+    for module in actor.modules():
+        is_last = isinstance(module, ProbabilisticTensorDictModule)
+        if is_last and module.distribution_class is TanhDelta:  # Else it refuses to be recorded.
+            module.distribution_kwargs = {**module.distribution_kwargs, "safe": False}
     weights = {name: _own(value) for name, value in actor.state_dict().items()}
     function = _Deterministic(actor, observation_key, action_key)
     # Leave the caller's random numbers alone.

@@ -75,6 +75,11 @@ class CostTally(Transform, abc.ABC):
         spec = rewards[self.cost_key]
         check_one_each("budget", self.budget, spec.shape[-1])
         check_column("reward_key", self.reward_key, rewards[self.reward_key], spec)
+        if not (dtype := rewards[self.reward_key].dtype).is_floating_point:
+            raise ValueError(
+                f"reward_key must be of floating-point numbers, got {dtype} for "
+                f"{self.reward_key!r}: a penalty of -0.5 would be 0."
+            )
         dtype = spec.dtype if spec.dtype.is_floating_point else torch.get_default_dtype()
         return Unbounded(spec.shape, dtype=dtype, device=spec.device)
 

@@ -163,7 +163,17 @@ class CostCritic(CostValues):
                 f"cost_critic_network must write {keys.cost_value!r}, got one that writes "
                 f"{written}: choose its out_keys, or call loss.set_keys(cost_value=...)."
             )
-        data = self._with_ends(self._with_features(tensordict))
+        time = [
+            self._time_of(estimator, tensordict)
+            for estimator in (self.value_estimator, self.cost_value_estimator)
+        ]
+        if time[0] != time[1]:
+            raise ValueError(
+                f"time_dim must be the same for reward and costs, got {time[0]} and {time[1]}: "
+                "pass it to make_value_estimator and make_cost_value_estimator, or name the "
+                "dimension 'time'."
+            )
+        data = self._with_ends(self._with_features(tensordict), time[0])
         self.value_estimator(
             data,
             params=self.critic_network_params.detach() if self.functional else None,
@@ -186,6 +196,13 @@ class CostCritic(CostValues):
         )
         data.set(keys.advantage, advantage)
         data.set(keys.cost_advantage, cost_advantage)
+        if mask is not None:  # NaN that counts for nothing would still reach the gradients.
+            for key in (
+                *(keys.advantage, keys.cost_advantage),
+                *(keys.value_target, keys.cost_value_target),
+            ):
+                values = data.get(key)
+                data.set(key, torch.where(expanded_mask(mask, values), values, 0.0))
         if data is not tensordict:
             hidden = [*self._shared_keys, *(unravel_key(("next", k)) for k in self._shared_keys)]
             tensordict.update(data.exclude(*hidden, *self._end_keys()))
@@ -224,7 +241,15 @@ class CostCritic(CostValues):
         following.update(self.actor_features(sequence))
         return data
 
-    def _with_ends(self, data: TensorDictBase) -> TensorDictBase:
+    @staticmethod
+    def _time_of(estimator: ValueEstimatorBase, data: TensorDictBase) -> int:
+        """The dimension along which an estimator sums."""
+        time = getattr(estimator, "time_dim", None)  # Not all of TorchRL's have it.
+        if time is None:
+            time = data.names.index("time") if "time" in data.names else data.ndim - 1
+        return time % data.ndim
+
+    def _with_ends(self, data: TensorDictBase, time: int) -> TensorDictBase:
         """The batch, with trajectories that end where what pads them begins.
 
         To an estimator the padding would be what followed.
@@ -234,11 +259,8 @@ class CostCritic(CostValues):
             return data
         keys = self._end_keys()
         done = get_or_raise(data, keys[0])
-        time = getattr(self.value_estimator, "time_dim", None)  # Not all of TorchRL's have it.
-        if time is None:
-            time = data.names.index("time") if "time" in data.names else data.ndim - 1
         mask = mask.reshape(data.shape).bool()
-        last = mask & ~mask.roll(-1, time % data.ndim)
+        last = mask & ~mask.roll(-1, time)
         terminated = data.get(keys[1], done)  # What estimators take for it.
         data = data.clone(False).set(keys[0], done | expanded_mask(last, done))
         return data.set(keys[1], terminated)

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, TypeVar
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
+from torch import nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
@@ -39,6 +40,12 @@ class CostValues(LossModule):
         self.register_state_dict_pre_hook(_build_value_estimators)
         self.register_load_state_dict_pre_hook(_build_value_estimators)
         self.register_load_state_dict_post_hook(_check_loaded_estimator)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # It would be registered beside the property of that name, and never be used.
+        if name in ("value_estimator", "cost_value_estimator") and isinstance(value, nn.Module):
+            raise AttributeError(f"{name} cannot be assigned: pass it to make_{name}.")
+        super().__setattr__(name, value)
 
     @abc.abstractmethod
     def _default_cost_estimator(self, **hyperparams: Any) -> ValueEstimatorBase:

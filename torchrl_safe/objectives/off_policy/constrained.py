@@ -77,6 +77,8 @@ class ConstrainedQLoss(CostValues):
                 list(actor_network.parameters()) if kwargs.get("separate_losses") else None
             ),
         )
+        # The parent has looked for dropout in its own critics only.
+        self.set_vmap_randomness("different")
         self.num_cost_qvalue_nets = num_cost_qvalue_nets
         device = next(self.parameters()).device
         self.register_buffer("lagrange_multiplier", multiplier.to(device))

@@ -113,7 +113,9 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             actor_params(self).data.clone(), no_convert=True
         )
         self._has_started = False
-        self.register_load_state_dict_post_hook(_start)
+        # A loss that is loaded has the improved policy of the state, if there is one.
+        self.register_buffer("has_improved_actor", torch.zeros((), dtype=torch.bool))
+        self.register_load_state_dict_post_hook(_read_start)
 
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
@@ -128,7 +130,8 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             self.improved_actor_params = TensorDictParams(present.clone(), no_convert=True)
         else:
             kept.update_(present)
-        _start(self)
+        self.has_improved_actor.fill_(True)
+        self._has_started = True
 
     def projection_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of the second phase. It trains the policy alone.
@@ -182,6 +185,6 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
         return (1 - estimator.gamma * estimator.lmbda) / (1 - estimator.gamma)
 
 
-def _start(loss: CUPLoss, *_: Any) -> None:
-    # Also a loss that is loaded: its improved policy comes with the state.
-    loss._has_started = True
+def _read_start(loss: CUPLoss, *_: Any) -> None:
+    # Compiled code could not branch on the buffer.
+    loss._has_started = bool(loss.has_improved_actor)

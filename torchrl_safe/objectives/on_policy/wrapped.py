@@ -97,10 +97,6 @@ class WrappedLoss(LossModule):
         """The value estimator of the reward."""
         return self.loss_module.value_estimator
 
-    @value_estimator.setter
-    def value_estimator(self, value: ValueEstimatorBase) -> None:
-        self.loss_module.value_estimator = value
-
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> WrappedLoss:
         """Chooses the value estimator of the reward: the wrapped loss's method."""
         self.loss_module.make_value_estimator(value_type, **hyperparams)
