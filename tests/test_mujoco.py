@@ -411,7 +411,7 @@ def test_a_forked_process_can_forget_an_environment():
 
 
 def test_there_is_no_window(make_env):
-    with pytest.raises(ValueError, match="gui must be False with MuJoCo"):
+    with pytest.raises(ValueError, match="gui must be False and render_mode not 'human'"):
         ArmEnv(physics=ONE, gui=True)
 
 

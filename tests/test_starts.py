@@ -133,6 +133,33 @@ def test_a_first_draw_that_fits_is_taken(make_env, task, obstacles):
     assert fits > 20
 
 
+class Stacked(Push):
+    """Two cubes where they are told to be."""
+
+    def __init__(self, *places):
+        super().__init__()
+        object.__setattr__(self, "places", np.array(places))
+
+    @property
+    def objects(self):
+        return self.shape, self.shape
+
+    def sample(self, rng, goals):
+        return np.array([0.65, 0.0, 0.02]), self.places
+
+
+@pytest.mark.usefixtures("engine")
+@pytest.mark.parametrize(
+    "places",
+    [[(0.35, 0, 0.22), (0.6, 0.1, 0.02)], [(0.6, 0.1, 0.02), (0.61, 0.1, 0.02)]],
+    ids=["in-the-hand", "in-each-other"],
+)
+def test_objects_do_not_overlap_the_arm_or_each_other(places):
+    """They would be thrown away, at more than a metre a second."""
+    with pytest.raises(ValueError, match=r"free the arm at home and the objects, got an over"):
+        ArmEnv(task=Stacked(*places), obstacles=NoObstacles())
+
+
 def test_what_hardly_ever_fits_is_refused():
     with pytest.raises(
         ValueError, match=r"no room today None of 100 draws of Reach\(.* was usable"

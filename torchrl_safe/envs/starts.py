@@ -89,8 +89,8 @@ class Starts:
     def _check_free(self, row: int) -> None:
         if (clearance := self._simulator.clearance(row)) <= 0:
             raise NoRoomError(
-                f"obstacles must leave the arm free at home and the objects where they are, got an "
-                f"overlap of {-clearance:.4f} m from {self._obstacles}."
+                "obstacles and objects must leave free the arm at home and the objects, got an "
+                f"overlap of {-clearance:.4f} m from {self._obstacles} and {self._task}."
             )
 
     def _draw_task(self, generator: np.random.Generator) -> tuple[Array, Array]:

@@ -168,9 +168,9 @@ class Simulator(Protocol):
         """
 
     def clearance(self, row: int) -> float:
-        """Returns the smallest distance of present obstacles from arm and objects in one world.
+        """Returns how far obstacles and objects are from the arm and objects in one world.
 
-        In m, negative where they overlap; 0.1 where it is more, or without obstacles.
+        The smallest distance, in m, negative where they overlap; 0.1 where it is more.
         """
 
     def nearest(self, rows: NDArray[np.int_], joints: Array, fingers: Array) -> Nearest:

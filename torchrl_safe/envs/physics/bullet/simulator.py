@@ -161,7 +161,7 @@ class BulletSimulator:
         return np.array([world.inverse_kinematics(*pose) for world, *pose in poses])
 
     def clearance(self, row: int) -> float:
-        """Returns the smallest distance of obstacles from arm and objects, up to 0.1 m."""
+        """Returns how far obstacles and objects are from arm and objects, up to 0.1 m."""
         return self.worlds[row].clearance()
 
     def nearest(self, rows: NDArray[np.int_], joints: Array, fingers: Array) -> Nearest:

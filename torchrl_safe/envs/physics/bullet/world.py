@@ -7,6 +7,7 @@ import os
 import sys
 import weakref
 from collections.abc import Sequence
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -379,13 +380,14 @@ class World:
         return self._readings.shapes()
 
     def clearance(self) -> float:
-        """Returns the smallest distance of obstacles from arm and objects, up to 0.1 m."""
+        """Returns how far obstacles and objects are from arm and objects, up to 0.1 m."""
+        kept_free = self._arm.body, *self._objects
+        present = [self._obstacles[index] for index in self._present]
         points = [
             point[8]
-            for index in self._present
-            for body in (self._arm.body, *self._objects)
+            for one, other in [*product(present, kept_free), *combinations(kept_free, 2)]
             for point in pybullet.getClosestPoints(
-                body, self._obstacles[index], FARTHEST, physicsClientId=self._client
+                one, other, FARTHEST, physicsClientId=self._client
             )
         ]
         return min(points, default=FARTHEST)

@@ -78,7 +78,9 @@ class MuJoCoSimulator:
         self._pose: tuple[Array, ToolPose] | None = None
         self._controls = np.zeros((num_envs, frame_skip, model.nu))
         self._fingers_rest = False  # Whether their motors do.
-        self._clearance = Clearance(model, [obstacle(index) for index in range(len(shapes))])
+        self._clearance = Clearance(
+            model, [*map(obstacle, range(len(shapes)))], [*map(thing, range(len(objects)))]
+        )
         self._ruler: Ruler | None = None
         if reach is not None:
             self._ruler = Ruler(
