@@ -3,6 +3,7 @@
 All numbers are those of counting.py: in step t, observation t, reward 10 t, cost t / 4.
 """
 
+import pickle
 from functools import partial
 
 import gymnasium
@@ -53,6 +54,12 @@ def check_counts(rollout, lengths):
     assert torch.equal(rollout["next", "cost"][..., 0], after / 4)
     assert rollout["next", "cost"].dtype == torch.float32
     assert "cost" not in rollout
+
+
+def test_an_environment_can_be_pickled(make_env):
+    env = make_env(SafeGymEnv, "counting:Counting-v0", steps=3)
+    again = make_env(pickle.loads, pickle.dumps(env))
+    check_counts(again.rollout(3), [3])
 
 
 @pytest.mark.parametrize("kind", ["Counting", "SixTuple"])
