@@ -214,7 +214,7 @@ figure.tight_layout()
 # ---------------------
 #
 # - Lower the ceiling to 0.21 m, or add ``"speed": Speed(limit=1.0)``. Two limits that exclude
-#   each other cannot both be kept: both multipliers then stay at their bound of 100.
+#   each other cannot both be kept: both multipliers then stay at their bound of 20.
 # - Train longer: ``FRAMES = 128_000``.
 # - Logs by name in TensorBoard: `Keep several limits at once <../howto/several_limits.html>`_.
 # - `The multiplier explodes <../howto/multiplier_explodes.html>`_.

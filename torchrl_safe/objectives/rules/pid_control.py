@@ -34,7 +34,7 @@ class PIDControl(MultiplierUpdater):
     integral stops where :math:`\lambda` is at its bound.
 
     **The defaults have no unit.** Far above the limit the multiplier is 1.2 after the first batch,
-    3 after six, 11 after twelve and at its bound of 100 after 24, whether costs are thousands or
+    3 after six, 11 after twelve and at its bound of 20 after 15, whether costs are thousands or
     thousandths. It is bounded: without a bound it could grow until the reward has no weight, before
     the task is learnt. The defaults need advantages without a unit, which the losses have by
     default (``normalize_cost_advantage``).
@@ -71,7 +71,8 @@ class PIDControl(MultiplierUpdater):
         smoothing (float, optional): weight of the past in the moving average of the cost, from 0
             up to but without 1. It starts at the first batch (algorithm 2 starts at 0, so that
             the first batch counts as a rise). Defaults to ``0.0``, the cost itself, as there.
-        max_multiplier (float, optional): see :class:`MultiplierUpdater`. Defaults to ``100.0``.
+        max_multiplier (float, optional): see :class:`MultiplierUpdater`. Defaults to ``20.0``,
+            where the reward has a twentieth of the weight.
         pessimism (float, optional): see :class:`MultiplierUpdater`. Defaults to ``2.0``.
         normalize (bool, optional): make violations relative (see :class:`MultiplierUpdater`), and
             steps relative to a multiplier above 1. Defaults to ``True``.
@@ -116,7 +117,7 @@ class PIDControl(MultiplierUpdater):
         ki: float = 0.2,
         kd: float = 0.0,
         smoothing: float = 0.0,
-        max_multiplier: float | None = 100.0,
+        max_multiplier: float | None = 20.0,
         pessimism: float = 2.0,
         normalize: bool = True,
         cost_names: Sequence[str] | None = None,
