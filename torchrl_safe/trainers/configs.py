@@ -161,7 +161,7 @@ class PIDControlConfig(UpdaterConfig):
     ki: float = 0.2
     kd: float = 0.0
     smoothing: float = 0.0
-    max_multiplier: float | None = 100.0
+    max_multiplier: float | None = 20.0
     pessimism: float = 2.0
     normalize: bool = True
     _target_: str = "torchrl_safe.objectives.PIDControl"
