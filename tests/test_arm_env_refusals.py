@@ -218,7 +218,9 @@ def test_fields_of_an_observation_stay_as_they_were(make_env, later, message):
 
 
 @pytest.mark.usefixtures("engine")
-@pytest.mark.parametrize("name", ["joint_lower", "obstacle_size", "goal", "joint_position"])
+@pytest.mark.parametrize(
+    "name", ["joint_lower", "joint_upper", "obstacle_size", "goal", "joint_position"]
+)
 def test_a_state_cannot_be_changed(make_env, name):
     """Costs, tasks, observations and motors share its arrays."""
     env = make_env(ArmEnv, seed=0)

@@ -6,10 +6,7 @@ from tensordict import TensorDict
 from torch.testing import assert_close
 from torchrl.collectors import Collector
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import (
-    EnvBase,
-    TransformedEnv,
-)
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_safe.envs import EarlyTermination, Saute

@@ -6,10 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import (
-    EnvBase,
-    TransformedEnv,
-)
+from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_safe.envs import EarlyTermination, Saute
 

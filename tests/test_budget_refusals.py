@@ -8,10 +8,7 @@ import torch
 from counting import CountingBatch, inside, with_costs
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import (
-    Transform,
-    TransformedEnv,
-)
+from torchrl.envs import Transform, TransformedEnv
 
 from torchrl_safe.envs import CostToReward, EarlyTermination, Saute
 from torchrl_safe.envs.transforms.budget import CostTally

@@ -5,16 +5,9 @@ import copy
 import pytest
 import torch
 from on_policy import OTHERS, SUBCLASSES, all_losses, free, make_composite
-from tensordict.nn import (
-    set_composite_lp_aggregate,
-)
+from tensordict.nn import set_composite_lp_aggregate
 from torch import nn
-from torchrl.objectives import (
-    ClipPPOLoss,
-    KLPENPPOLoss,
-    LossModule,
-    SoftUpdate,
-)
+from torchrl.objectives import ClipPPOLoss, KLPENPPOLoss, LossModule, SoftUpdate
 
 from torchrl_safe.objectives import (
     CRPOLoss,

@@ -20,13 +20,7 @@ from torchrl.modules import (
 )
 from torchrl.objectives import SoftUpdate
 
-from torchrl_safe.objectives import (
-    CUPLoss,
-    FOCOPSLoss,
-    IPOLoss,
-    P3OLoss,
-    TrustRegionLoss,
-)
+from torchrl_safe.objectives import CUPLoss, FOCOPSLoss, IPOLoss, P3OLoss, TrustRegionLoss
 from torchrl_safe.objectives.on_policy.policies import divergence
 from torchrl_safe.testing import make_batch, make_critic
 

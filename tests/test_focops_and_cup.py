@@ -9,19 +9,10 @@ from first_order import actor_gradient, build, old_policy, policy, shift, step
 from on_policy import estimated, train
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch.distributions import kl_divergence
-from torchrl.modules import (
-    IndependentNormal,
-    ProbabilisticActor,
-)
+from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
-from torchrl_safe.objectives import (
-    CUPLoss,
-    FOCOPSLoss,
-    IPOLoss,
-    P3OLoss,
-    penalized_advantage,
-)
+from torchrl_safe.objectives import CUPLoss, FOCOPSLoss, IPOLoss, P3OLoss, penalized_advantage
 from torchrl_safe.testing import make_batch, make_critic
 
 

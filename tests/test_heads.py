@@ -5,11 +5,7 @@ import copy
 import pytest
 import torch
 from on_policy import OTHERS, SUBCLASSES, all_losses, every_loss, free
-from tensordict.nn import (
-    NormalParamExtractor,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-)
+from tensordict.nn import NormalParamExtractor, ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torchrl.modules import (
     ActorValueOperator,
@@ -18,13 +14,9 @@ from torchrl.modules import (
     ProbabilisticActor,
     ValueOperator,
 )
-from torchrl.objectives import (
-    KLPENPPOLoss,
-)
+from torchrl.objectives import KLPENPPOLoss
 
-from torchrl_safe.objectives import (
-    PPOLagrangianLoss,
-)
+from torchrl_safe.objectives import PPOLagrangianLoss
 from torchrl_safe.testing import OBSERVATION_SIZE, make_batch
 
 

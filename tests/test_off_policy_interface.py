@@ -22,16 +22,8 @@ from torch import nn
 from torchrl.modules import MLP
 from torchrl.objectives import SoftUpdate
 
-from torchrl_safe.objectives import (
-    CostGAE,
-    TD3LagrangianLoss,
-)
-from torchrl_safe.testing import (
-    check_compile,
-    make_q_critic,
-    make_q_networks,
-    make_transitions,
-)
+from torchrl_safe.objectives import CostGAE, TD3LagrangianLoss
+from torchrl_safe.testing import check_compile, make_q_critic, make_q_networks, make_transitions
 
 # ---------------------------------------------------------------- what does not fit
 

@@ -9,11 +9,7 @@ from on_policy import estimated
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_safe.objectives import (
-    CUPLoss,
-    IPOLoss,
-    P3OLoss,
-)
+from torchrl_safe.objectives import CUPLoss, IPOLoss, P3OLoss
 from torchrl_safe.objectives.on_policy.crpo import rectified_advantage
 from torchrl_safe.objectives.on_policy.ipo import log_barrier
 from torchrl_safe.objectives.on_policy.surrogate import clipped_cost_surrogate

@@ -6,13 +6,7 @@ import attack
 import pytest
 from worlds import ENGINES, Places, each_arm
 
-from torchrl_safe.envs import (
-    PANDA,
-    UR5,
-    Cylinder,
-    InFront,
-    Shield,
-)
+from torchrl_safe.envs import PANDA, UR5, Cylinder, InFront, Shield
 
 
 @pytest.mark.parametrize("kind", attack.ATTACKS)
