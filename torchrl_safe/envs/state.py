@@ -124,7 +124,8 @@ class ArmState:
     """State of N worlds after a control step or a reset, in SI units and world coordinates.
 
     n is the number of arm joints, f of free finger joints, p of objects that the task moves, m
-    of obstacles. Orientations are quaternions (x, y, z, w).
+    of obstacles. Orientations are quaternions (x, y, z, w). The arrays of an
+    environment's states are read-only.
 
     Attributes:
         joint_position: joint angles, rad, ``(N, n)``.

@@ -197,10 +197,8 @@ class CostCritic(CostValues):
         data.set(keys.advantage, advantage)
         data.set(keys.cost_advantage, cost_advantage)
         if mask is not None:  # NaN that counts for nothing would still reach the gradients.
-            for key in (
-                *(keys.advantage, keys.cost_advantage),
-                *(keys.value_target, keys.cost_value_target),
-            ):
+            targets = keys.value_target, keys.cost_value_target
+            for key in (keys.advantage, keys.cost_advantage, *targets):
                 values = data.get(key)
                 data.set(key, torch.where(expanded_mask(mask, values), values, 0.0))
         if data is not tensordict:
