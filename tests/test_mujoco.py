@@ -39,6 +39,7 @@ from torchrl_safe.envs import (
     Swing,
 )
 from torchrl_safe.envs.physics.mujoco import MuJoCo
+from torchrl_safe.envs.physics.mujoco.bodies import TABLE
 from torchrl_safe.envs.physics.mujoco.chain import Chain
 from torchrl_safe.envs.physics.mujoco.model import build_world
 from torchrl_safe.envs.physics.mujoco.readings import CONTACT_RANGE
@@ -270,7 +271,7 @@ def test_links_that_cannot_reach_the_table_are_not_tested_against_it(arm, links)
     model = build_world(arm, Scene(), (), (), Sensing()).model
     pairs = [divmod(int(pair), 2**16) for pair in model.exclude_signature]
     assert [model.body(link).name for world, link in pairs if world == 0] == links
-    data, table = mujoco.MjData(model), model.geom("table").id
+    data, table = mujoco.MjData(model), model.geom(TABLE).id
     lower, upper = np.where(model.jnt_limited, model.jnt_range.T, [[-np.pi], [np.pi]])
     for pose in np.random.default_rng(0).uniform(lower, upper, (300, model.nq)):
         data.qpos[:] = pose

@@ -321,11 +321,11 @@ def joint(number, *parts, kind="revolute", axis="0 1 0", limit='lower="-3" upper
 def make_chain(make_env, tmp_path):
     """An arm of three joints, the second of which is given."""
 
-    def make(second, shape="<sphere radius='0.03'/>"):
-        links = [link("l0"), link("l1"), link("l2", shape), link("l3")]
-        ends = joint(1, axis="0 0 1"), joint(3)
+    def make(second, shape="<sphere radius='0.03'/>", tool="l3"):
+        links = [link("l0"), link("l1"), link("l2", shape), link(tool)]
+        ends = joint(1, axis="0 0 1"), joint(3).replace("l3", tool)
         urdf = make_urdf(tmp_path / "chain.urdf", *links, second, *ends)
-        model = ArmModel(urdf, "l3", home=(0.1, 0.4, 0.8))
+        model = ArmModel(urdf, tool, home=(0.1, 0.4, 0.8))
         # Where the tool is at home.
         task = Reach(Region((0.077, 0.007, 0.584), (0.078, 0.008, 0.585)))
         return make_env(
@@ -365,6 +365,19 @@ def test_joints_that_cannot_be_driven_are_refused(make_chain):
         make_chain(joint(2, '<mimic joint="j1"/>'))
     with pytest.raises(ValueError, match="axis of joint 'j2' must not be zero"):
         make_chain(joint(2, axis="0 0 0"))
+
+
+@pytest.mark.usefixtures("engine")
+def test_an_arm_may_have_any_names(make_chain):
+    """Also those of what else is to be seen."""
+    ball = 'name="table"><geometry><sphere radius="0.05"/></geometry>'
+    extra = (
+        f'<link name="world"><visual {ball}</visual><collision {ball}</collision></link>'
+        '<joint name="sky" type="fixed"><parent link="goal"/><child link="world"/></joint>'
+    )
+    env = make_chain(joint(2) + extra, tool="goal")
+    env.reset()
+    assert env.render(64, 48).float().std() > 10
 
 
 @pytest.mark.usefixtures("engine")

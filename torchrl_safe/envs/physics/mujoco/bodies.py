@@ -20,8 +20,8 @@ from torchrl_safe.envs.physics.palette import (
 )
 from torchrl_safe.envs.physics.scene import TABLE_CENTRE, TABLE_SHAPE
 
-#: Name of the table's shape; its top is at height 0.
-TABLE = "table"
+#: Name of the table's shape, which no arm has; its top is at height 0.
+TABLE = "scene/table"
 
 
 def obstacle(index: int) -> str:

@@ -17,7 +17,7 @@ from torchrl_safe.envs.physics.palette import (
 from torchrl_safe.envs.physics.scene import FLOOR_HEIGHT, FLOOR_SIZE
 
 #: Name of the ball where the goal is, which comes after all other bodies.
-GOAL = "goal"
+GOAL = "scene/goal"
 _HIDDEN = 3  # A group of shapes that is not drawn.
 
 
