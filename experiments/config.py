@@ -13,6 +13,7 @@ from typing import Any, Literal
 import tyro
 
 from experiments.options import check_once, short_help
+from torchrl_safe._checks import check_count, check_not_negative, check_positive
 from torchrl_safe._cores import cores
 from torchrl_safe.envs import SUITE, PickAndPlace, Push, Reach
 
@@ -178,19 +179,17 @@ class Config:
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "workers", "jobs", "eval_episodes", "frames_per_batch")
         more = ("epochs", "minibatch", "checkpoint_every", "episode_steps", "hidden")
-        for name in (*counts, *more):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}.")
+        values = {name: getattr(self, name) for name in (*counts, *more)}
+        check_count(**{name: value for name, value in values.items() if value is not None})
         for name in ("first_log_std", "last_log_std"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)}.")
-        for name in ("learning_rate", "multiplier_rate"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
-        for name in ("cost_limit", "multiplier_init", "pessimism"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
+        check_positive(learning_rate=self.learning_rate, multiplier_rate=self.multiplier_rate)
+        check_not_negative(
+            cost_limit=self.cost_limit,
+            multiplier_init=self.multiplier_init,
+            pessimism=self.pessimism,
+        )
         if not 0 < self.limit_share <= 1:
             raise ValueError(
                 f"limit_share must be more than 0 and at most 1, got {self.limit_share}."

@@ -20,15 +20,16 @@ from pathlib import Path
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from experiments import train
 from experiments.agent import num_costs
 from experiments.config import Config as TrainConfig, Engine
 from experiments.files import write_whole
-from experiments.film import save_film
+from experiments.film import base_env, save_film
 from experiments.report import figures_table
+from torchrl_safe._checks import check_count
 from torchrl_safe.envs import ArmEnv
 from torchrl_safe.envs.gym import SafeGymEnv, SafeGymWrapper
 from torchrl_safe.evaluation import evaluate, summarize
@@ -75,9 +76,8 @@ class Config:
     """Folder for table.md and results.json; by default the table is only printed."""
 
     def __post_init__(self) -> None:
-        for name, least in (("episodes", 2), ("envs", 1), ("shown", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}.")
+        check_count(least=2, episodes=self.episodes)
+        check_count(envs=self.envs, shown=self.shown)
         if not all(0 <= limit < math.inf for limit in self.cost_limits):
             raise ValueError(f"cost_limits must not be negative, got {self.cost_limits}.")
         if self.video is not None and self.video.suffix not in (".gif", ".webp"):
@@ -157,7 +157,7 @@ def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
             f"cost_limits must be one for each of the {costs} costs of env, got {limits}: pass "
             "--cost-limits."
         )
-    if config.video is not None and not is_arm(env):
+    if config.video is not None and not isinstance(base_env(env), ArmEnv):
         raise ValueError(f"video films an ArmEnv, got {str(config.video)!r} with {env}.")
 
 
@@ -166,16 +166,6 @@ def cost_names(env: EnvBase) -> tuple[str, ...]:
     base = base_env(env)
     named = isinstance(base, ArmEnv | SafeGymEnv | SafeGymWrapper)
     return base.cost_names if named else tuple(map(str, range(num_costs(env))))
-
-
-def is_arm(env: EnvBase) -> bool:
-    """Tells whether it is an arm that the environment moves."""
-    return isinstance(base_env(env), ArmEnv)
-
-
-def base_env(env: EnvBase) -> EnvBase:
-    """The environment without its transforms."""
-    return env.base_env if isinstance(env, TransformedEnv) else env
 
 
 def play(

@@ -229,13 +229,18 @@ def _stage(env: EnvBase, times: int) -> tuple[EnvBase, Pace]:
     return env, Pace(every=every, repeats=wanted)
 
 
+def base_env(env: EnvBase) -> EnvBase:
+    """The environment without its transforms."""
+    return env.base_env if isinstance(env, TransformedEnv) else env
+
+
 def _transforms(env: EnvBase) -> list[Any]:
     assert isinstance(env, TransformedEnv)
     return list(env.transform) if isinstance(env.transform, Compose) else [env.transform]
 
 
 def _arm(env: EnvBase) -> ArmEnv:
-    arm = env.base_env if isinstance(env, TransformedEnv) else env
+    arm = base_env(env)
     assert isinstance(arm, ArmEnv)
     return arm
 

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from experiments.files import write_whole
 from experiments.log import versions
 from experiments.options import check_once
+from torchrl_safe._checks import check_count
 from torchrl_safe.checkpoint import refuse_other_settings
 
 
@@ -25,8 +26,7 @@ def check_grid(config: Any, *names: str) -> None:
     """Checks the settings of a grid: ``jobs``, and what it goes through, each thing once."""
     for name in names:
         check_once(name, getattr(config, name))
-    if config.jobs < 1:
-        raise ValueError(f"jobs must be at least 1, got {config.jobs}.")
+    check_count(jobs=config.jobs)
 
 
 def missing(jobs: Mapping[Path, Any]) -> list[Path]:

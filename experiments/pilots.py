@@ -33,6 +33,8 @@ _ABOVE_TABLE = 0.12
 # How far the tool goes in a control step beside what moves, m. Where that is not far off, it slows
 # down, m.
 _PACE, _SLOWER = 0.027, 0.1
+# How far an object is pushed in a control step, m.
+_PUSH = 0.02
 # What of the hand is to be out of the way: heights above the tool point, and half its width, m.
 _HAND, _HALF_WIDTH = (0.0, 0.1, 0.2), 0.07
 # How high an obstacle is that the hand passes over while the fingers are at the table, and how far
@@ -141,12 +143,10 @@ class PushPilot:
     Args:
         room: half axes of the ellipse around each obstacle that the object stays out of, m, along
             x, where the hand is wide, and y.
-        speed: how far it is pushed in a control step, m.
         care: how far it keeps off obstacles; less makes the room narrower.
     """
 
-    room: tuple[float, float] = (0.22, 0.15)
-    speed: float = 0.02
+    room: tuple[float, float]
     care: Care = CAREFUL
 
     def __call__(self, state: ArmState) -> tuple[Array, Array]:
@@ -170,7 +170,7 @@ class PushPilot:
         ring = place[:, :2] + 0.065 * np.column_stack([np.cos(direction), np.sin(direction)])
         # Pushing on the side to which the object has strayed brings it back to the line.
         across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-        forward = self.speed * np.clip(1 - np.abs(angle) / 0.6, 0.2, 1)[:, None]
+        forward = _PUSH * np.clip(1 - np.abs(angle) / 0.6, 0.2, 1)[:, None]
         push = tool[:, :2] + forward * ahead - side[:, None] * across
         straight = (np.abs(angle) < 0.5)[:, None]
         flat = np.where(straight, push, ring)
@@ -231,7 +231,7 @@ def make_pilot(env: ArmEnv, care: Care = CAREFUL) -> Pilot:
     along = {PANDA: 0.27, IIWA: 0.18}.get(env.arm, 0.22)
     pilots: dict[type, Pilot] = {
         Reach: ReachPilot(care),
-        Push: PushPilot((along, 0.15), care=care),
+        Push: PushPilot((along, 0.15), care),
         PickAndPlace: PickAndPlacePilot(care),
     }
     if type(env.task) not in pilots:

@@ -38,6 +38,7 @@ from experiments.compiling import compiled
 from experiments.files import as_json, lasting, run_to_resume, write_whole
 from experiments.learners import NOT_LEARNT_FROM, Objective, moved_from_here, summed, tell_length
 from experiments.log import Log, figures, versions
+from torchrl_safe._checks import check_count, check_positive
 from torchrl_safe.checkpoint import RunCheckpoints
 from torchrl_safe.envs.gym import SafeGymEnv
 from torchrl_safe.evaluation import evaluate, summarize
@@ -122,16 +123,17 @@ class Config:
 
     def __post_init__(self) -> None:
         counts = ("frames", "envs", "checkpoint_every", "eval_episodes", "frames_per_batch")
-        for name in (*counts, "epochs", "minibatch", "random_frames"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        names = (*counts, "epochs", "minibatch", "random_frames")
+        check_count(**{name: getattr(self, name) for name in names})
         if self.envs == self.eval_episodes == 1:
             raise ValueError("eval_episodes must be at least 2 with one environment, got 1.")
         if not 0 <= self.seed < EVALUATION:
             raise ValueError(f"seed must be at least 0 and below {EVALUATION}, got {self.seed}.")
-        for name in ("max_kl", "learning_rate", "max_grad_norm"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        check_positive(
+            max_kl=self.max_kl,
+            learning_rate=self.learning_rate,
+            max_grad_norm=self.max_grad_norm,
+        )
         if not 0 < self.gamma < 1:
             raise ValueError(f"gamma must be between 0 and 1, got {self.gamma}.")
         if not all(0 <= limit < math.inf for limit in self.cost_limit):

@@ -25,6 +25,7 @@ from experiments.config import (
 from experiments.gallery import WITH_PERSON
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.suite_report import draw
+from torchrl_safe._checks import check_count
 from torchrl_safe._cores import cores
 from torchrl_safe.envs import SUITE
 
@@ -54,10 +55,9 @@ class Config:
         check_grid(self, "tasks", "algorithms", "seeds")
         for task, algorithm in product(self.tasks, self.algorithms):
             suite_config(task, algorithms=(algorithm,))  # Raises if it cannot be trained there.
-        if self.frames is not None and self.frames < 1:
-            raise ValueError(f"frames must be at least 1, got {self.frames}.")
-        if self.eval_episodes < 2:
-            raise ValueError(f"eval_episodes must be at least 2, got {self.eval_episodes}.")
+        if self.frames is not None:
+            check_count(frames=self.frames)
+        check_count(least=2, eval_episodes=self.eval_episodes)
 
 
 def folder(out: Path, task: str, seed: int) -> Path:

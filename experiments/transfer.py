@@ -25,6 +25,7 @@ from experiments.algorithms import ALGORITHMS, no_transforms
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import shown_cost
 from experiments.suite_report import excess
+from torchrl_safe._checks import check_count
 from torchrl_safe._cores import cores
 from torchrl_safe.envs import (
     SUITE,
@@ -89,8 +90,7 @@ class Config:
 
     def __post_init__(self) -> None:
         check_grid(self, "conditions")
-        if self.episodes < 2:
-            raise ValueError(f"episodes must be at least 2, got {self.episodes}.")
+        check_count(least=2, episodes=self.episodes)
         if not self.chosen:
             raise ValueError("policies must name at least one: none comes with the package.")
 

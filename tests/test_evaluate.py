@@ -104,7 +104,7 @@ def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"episodes": 1}, "episodes must be at least 2, got 1"),
+        ({"episodes": 1}, "episodes must be a whole number of at least 2, got 1"),
         ({"cost_limits": (-1.0,)}, "cost_limits must not be negative, got .-1.0"),
         ({"cost_limits": (1.0, 2.0)}, "cost_limits must be one for each of the 1 costs of env"),
         ({"video": Path("a.mov")}, "video must end in .gif or .webp, got 'a.mov'"),

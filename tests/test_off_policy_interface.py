@@ -77,7 +77,7 @@ def test_multiplier_init_must_have_one_number_for_each_cost(kind, shape):
 @pytest.mark.parametrize("init", [-0.1, float("nan"), float("inf")])
 @each_loss
 def test_multiplier_init_must_be_finite_and_not_negative(kind, init):
-    with pytest.raises(ValueError, match="multiplier_init must be finite and not negative"):
+    with pytest.raises(ValueError, match="multiplier_init must be a number from 0 to"):
         make_loss(kind, multiplier_init=init)
 
 

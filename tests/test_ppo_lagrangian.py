@@ -412,7 +412,7 @@ def test_multiplier_init_is_one_number_or_one_for_each_cost(init):
     ids=["negative", "nan", "inf", "one-negative"],
 )
 def test_multiplier_init_must_be_finite_and_not_negative(init):
-    with pytest.raises(ValueError, match="multiplier_init must be finite and not negative"):
+    with pytest.raises(ValueError, match="multiplier_init must be a number from 0 to"):
         make_loss(2, multiplier_init=init)
 
 

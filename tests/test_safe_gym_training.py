@@ -354,7 +354,7 @@ def test_divergence_is_that_of_the_distributions(make_env):
         ({"frames_per_batch": 81}, "multiple of envs"),
         ({"gamma": 1.0}, "gamma must be between 0 and 1"),
         ({"max_kl": 0.0}, "max_kl must be positive"),
-        ({"epochs": 0}, "epochs must be at least 1"),
+        ({"epochs": 0}, "epochs must be a whole number of at least 1"),
         ({"seed": -1}, "seed must be at least 0 and below 2147483648, got -1"),
     ],
 )

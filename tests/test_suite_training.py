@@ -355,9 +355,9 @@ def test_results_of_another_definition_are_refused(tmp_path):
         ({"seeds": (1, 1)}, r"seeds must name at least one, each once, got \(1, 1\)"),
         ({"algorithms": ("ppo", "cpo")}, "algorithms must not contain cpo with several costs"),
         ({"algorithms": ("sac-lagrangian",)}, "demonstrations must be 0 with sac-lagrangian"),
-        ({"jobs": 0}, "jobs must be at least 1, got 0"),
-        ({"frames": 0}, "frames must be at least 1, got 0"),
-        ({"eval_episodes": 1}, "eval_episodes must be at least 2, got 1"),
+        ({"jobs": 0}, "jobs must be a whole number of at least 1, got 0"),
+        ({"frames": 0}, "frames must be a whole number of at least 1, got 0"),
+        ({"eval_episodes": 1}, "eval_episodes must be a whole number of at least 2, got 1"),
     ],
 )
 def test_bad_settings(settings, message):

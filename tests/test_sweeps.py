@@ -169,5 +169,5 @@ def test_comparison_trains_what_it_is_told(tmp_path):
 def test_a_grid_of_no_seed_or_no_process_is_refused(config):
     with pytest.raises(ValueError, match=r"seeds must name at least one, each once, got \(\)"):
         config(seeds=())
-    with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="jobs must be a whole number of at least 1, got 0"):
         config(jobs=0)

@@ -245,8 +245,8 @@ def test_costs_above_their_limits_are_bold():
     ("settings", "message"),
     [
         ({"conditions": ()}, r"conditions must name at least one, each once, got \(\)"),
-        ({"episodes": 1}, "episodes must be at least 2, got 1"),
-        ({"jobs": 0}, "jobs must be at least 1, got 0"),
+        ({"episodes": 1}, "episodes must be a whole number of at least 2, got 1"),
+        ({"jobs": 0}, "jobs must be a whole number of at least 1, got 0"),
     ],
 )
 def test_bad_settings(settings, message):

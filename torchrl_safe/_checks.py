@@ -20,14 +20,14 @@ _LARGEST = np.finfo(np.float32).max
 def check_positive(**values: float) -> None:
     """Raises ValueError unless each value is a number, positive and finite."""
     for name, value in values.items():
-        if not _is_finite(value) or value <= 0:
+        if not 0 < as_number(value) < math.inf:
             raise ValueError(f"{name} must be positive and finite, got {value!r}.")
 
 
 def check_not_negative(**values: float) -> None:
     """Raises ValueError unless each value is a number, not negative and finite."""
     for name, value in values.items():
-        if not _is_finite(value) or value < 0:
+        if not 0 <= as_number(value) < math.inf:
             raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
 
 
@@ -148,8 +148,9 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def _is_finite(value: Any) -> bool:
+def as_number(value: Any) -> float:
+    """The value of a real number, NaN of anything else."""
     try:
-        return is_number(value) and math.isfinite(value)
+        return float(value) if is_number(value) else math.nan
     except OverflowError:  # Python's integers can be larger than any float.
-        return False
+        return math.nan

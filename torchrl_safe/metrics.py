@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_safe._checks import as_tensor, check_one_each, is_number
+from torchrl_safe._checks import as_number, as_tensor, check_one_each
 
 try:
     from scipy import stats
@@ -292,7 +292,7 @@ def conditional_value_at_risk(episode_cost: Tensor, alpha: float) -> Tensor:
         >>> conditional_value_at_risk(cost, 0.375)  # (5 + 0.5 * 2) / 1.5
         tensor([4.], dtype=torch.float64)
     """
-    if not is_number(alpha) or not 0 < alpha <= 1:
+    if not 0 < as_number(alpha) <= 1:
         raise ValueError(f"alpha must be above 0 and at most 1, got {alpha}.")
     cost = _by_seed("episode_cost", episode_cost).flatten(0, 1).sort(0, descending=True).values
     weight = (alpha * len(cost) - torch.arange(len(cost), dtype=cost.dtype)).clamp(0, 1)
@@ -411,7 +411,7 @@ def _limit(cost_limit: float | Tensor, cost: Tensor) -> Tensor:
 
 
 def _check_confidence(confidence: float) -> None:
-    if not is_number(confidence) or not 0 < confidence < 1:
+    if not 0 < as_number(confidence) < 1:
         raise ValueError(f"confidence must be between 0 and 1, got {confidence}.")
 
 

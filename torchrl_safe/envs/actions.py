@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe._checks import check_flag, check_positive, check_unit, is_number, keep_numbers
+from torchrl_safe._checks import as_number, check_flag, check_positive, check_unit, keep_numbers
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
@@ -222,11 +222,7 @@ def _finger_targets(action: Array, state: ArmState, step: float | None) -> Array
 
 def check_bound(bound: float) -> None:
     """Raises ValueError unless a bound is positive, and infinite or a number of float32."""
-    try:
-        usable = is_number(bound) and float(bound) > 0
-    except OverflowError:  # An integer too large for a float.
-        usable = False
-    if not usable:
+    if not as_number(bound) > 0:
         raise ValueError(f"bound must be positive, got {bound!r}.")
     # Random actions are drawn from an interval, whose length must be a number of the spec's dtype.
     largest = float(np.finfo(np.float32).max) / 2

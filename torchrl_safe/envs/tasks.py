@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_safe._checks import check_flag, check_kind, check_positive, is_number
+from torchrl_safe._checks import as_number, check_flag, check_kind, check_positive
 from torchrl_safe.envs.obstacles.shapes import Box, Shape, check_shapes
 from torchrl_safe.envs.regions import NoRoomError, Region
 from torchrl_safe.envs.state import ArmState, Array
@@ -102,7 +102,7 @@ class Reach:
     def __post_init__(self) -> None:
         _check(self.region, self.radius)
         check_flag(sparse=self.sparse)
-        if not is_number(self.order) or not self.order >= 1:
+        if not as_number(self.order) >= 1:
             raise ValueError(f"order must be at least 1, got {self.order!r}.")
 
     @property
@@ -272,7 +272,7 @@ class PickAndPlace:
                 f"side, got {self.shape}."
             )
         _check_distance(self.distance, self.radius)
-        if not is_number(self.on_table) or not 0 <= self.on_table <= 1:
+        if not 0 <= as_number(self.on_table) <= 1:
             raise ValueError(f"on_table must be between 0 and 1, got {self.on_table!r}.")
 
     @property

@@ -10,11 +10,11 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_safe._checks import as_tensor, check_one_each, is_number
+from torchrl_safe import _checks
+from torchrl_safe._checks import as_tensor, check_one_each
 
-# Losses compute in single precision, also with squares of what is positive, and divide by them.
-_LARGEST = torch.finfo(torch.float32).max
-_SMALLEST, _LARGE = 1e-18, 1e18
+# Their squares are neither 0 nor infinite in single precision, in which losses compute.
+SMALLEST, LARGEST = 1e-18, 1e18
 
 
 def uncompiled(loss_module: Any) -> Any:
@@ -22,52 +22,29 @@ def uncompiled(loss_module: Any) -> Any:
     return getattr(loss_module, "_orig_mod", loss_module)
 
 
-def check_number(name: str, value: Any, *, positive: bool = False) -> float:
-    """Returns the value; raises ValueError unless it is finite, not negative or even positive.
+def check_number(name: str, value: Any, least: float = 0.0, most: float = LARGEST) -> float:
+    """Returns the value; raises ValueError unless it is a number from ``least`` to ``most``.
 
     Always a float: a buffer made of an integer would hold integers for ever.
     """
     number = as_number(value)
-    if positive and not _SMALLEST <= number <= _LARGE:
-        raise ValueError(f"{name} must be positive, from 1e-18 to 1e18, got {value!r}.")
-    if not 0 <= number <= _LARGEST:
-        raise ValueError(f"{name} must be finite and not negative, got {value!r}.")
-    if number > _LARGE:  # Times a loss it would soon be infinite.
-        raise ValueError(f"{name} must be at most 1e18, got {value!r}.")
+    if not least <= number <= most:
+        raise ValueError(f"{name} must be a number from {least:g} to {most:g}, got {value!r}.")
     return number
 
 
-def coefficients(name: str, value: Any, num_costs: int, *, positive: bool = False) -> Tensor:
+def coefficients(name: str, value: Any, num_costs: int, least: float = 0.0) -> Tensor:
     """One number, shape ``()``, or one for each cost, ``(k,)``; see :func:`check_number`."""
     numbers = as_tensor(name, value, torch.get_default_dtype())
     check_one_each(name, numbers, num_costs)
     for number in value if numbers.ndim else [value]:
-        check_number(name, number, positive=positive)
+        check_number(name, number, least)
     return numbers.clone()
-
-
-def check_share(name: str, value: Any) -> float:
-    """Returns the value; raises ValueError unless it is a number from 0 to 1."""
-    number = as_number(value)
-    if not 0 <= number <= 1:
-        raise ValueError(f"{name} must be a number from 0 to 1, got {value!r}.")
-    return number
-
-
-def check_discount(gamma: Tensor) -> None:
-    """Raises ValueError unless an episode has 1 / (1 - gamma) steps, a finite number."""
-    if not gamma < 1:
-        raise ValueError(f"gamma of the costs must be below 1, got {gamma.item()}.")
 
 
 def check_episode_length(episode_length: float | None) -> float | None:
     """Returns the value; raises ValueError unless it is at least one step, or None."""
-    if episode_length is None:
-        return None
-    length = check_number("episode_length", episode_length, positive=True)
-    if length < 1:
-        raise ValueError(f"episode_length must be at least 1, got {episode_length!r}.")
-    return length
+    return None if episode_length is None else check_number("episode_length", episode_length, 1)
 
 
 def check_length_known(episode_length: float | None, gamma: Tensor) -> None:
@@ -83,10 +60,7 @@ def as_number(value: Any) -> float:
     """The value of a number or of a tensor with one element, NaN of anything else."""
     if isinstance(value, Tensor):
         return float(value.detach()) if value.numel() == 1 and not value.is_complex() else math.nan
-    try:
-        return float(value) if is_number(value) else math.nan
-    except OverflowError:
-        return math.nan
+    return _checks.as_number(value)
 
 
 def initial_multiplier(num_costs: int, multiplier_init: float | Tensor) -> Tensor:

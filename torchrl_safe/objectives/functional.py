@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_safe.objectives._checks import check_columns, check_rows, check_share
+from torchrl_safe.objectives._checks import check_columns, check_number, check_rows
 
 
 def scaled_advantages(
@@ -120,7 +120,7 @@ def cost_advantage_scale(
         (tensor([4.2426]), tensor([4.1578]))
     """
     check_columns(cost_advantage, "scale", past)
-    memory = check_share("memory", memory)
+    memory = check_number("memory", memory, most=1)
     rows = tuple(range(cost_advantage.ndim - 1))
     if counted is not None:  # What does not count may be NaN.
         counted = counted.expand_as(cost_advantage)

@@ -2,7 +2,7 @@
 
 Two protocols: a :class:`Physics` is the frozen object that a user passes
 (``ArmEnv(physics=Bullet())``); it builds the :class:`Simulator` of an environment. Each engine
-has a folder beside this file, the only place that imports or names it. If an engine is not
+has a folder beside this file, the only place that imports it. If an engine is not
 installed, :meth:`Physics.build` raises an ImportError.
 
 Units are SI, coordinates are those of the world, orientations are quaternions (x, y, z, w). N is

@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torchrl_safe._checks import check_array, is_number
+from torchrl_safe._checks import as_number, check_array
 from torchrl_safe.envs.transforms.budget import ROUNDING, CostTally
 
 
@@ -88,7 +88,7 @@ class Saute(CostTally):
         )
         if not (self.budget > 0).all():
             raise ValueError(f"budget must be above 0, got {budget}.")
-        if not is_number(discount) or not 0 < discount <= 1:
+        if not 0 < as_number(discount) <= 1:
             raise ValueError(f"discount must be above 0 and at most 1, got {discount!r}.")
         self.unsafe_reward: float = float(check_array("unsafe_reward", unsafe_reward, ()))
         self.discount: float = discount

@@ -45,10 +45,9 @@ class CostCritic(CostValues):
 
     It stands before that loss among the bases, whose constructor gets all arguments but
     ``cost_critic_network``, ``num_costs`` and ``cost_critic_coeff``. The class that joins the two
-    declares ``_AcceptedKeys(CostKeys, ...)`` and ``default_keys``. Of the loss are read its
-    networks, ``functional``, ``separate_losses``, ``reduction``, ``clip_value``,
-    ``loss_critic_type``, ``log_explained_variance``, ``advantage_norm`` and
-    ``normalize_advantage_exclude_dims``.
+    declares ``_AcceptedKeys(CostKeys, ...)`` and ``default_keys``. It reads the loss's networks,
+    ``functional``, ``separate_losses``, ``reduction``, ``clip_value``, ``loss_critic_type``,
+    ``log_explained_variance``, ``advantage_norm`` and ``normalize_advantage_exclude_dims``.
     """
 
     _schedulable_buffers = frozenset({"cost_critic_coeff"})
@@ -142,7 +141,7 @@ class CostCritic(CostValues):
             self._estimate_advantages(tensordict)
         return tensordict
 
-    # Without: in a call of the loss, value targets would have a gradient by a shared trunk.
+    # With gradients, a call of the loss would train a shared trunk through the value targets.
     @torch.no_grad()
     def _estimate_advantages(self, tensordict: TensorDictBase) -> None:
         keys = self.tensor_keys

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
-from torchrl_safe.objectives._checks import check_share, get_or_raise, refuse_options
+from torchrl_safe.objectives._checks import check_number, get_or_raise, refuse_options
 
 
 class CostGAE(GAE):
@@ -95,8 +95,8 @@ class CostGAE(GAE):
         reason = "scaled_advantages scales advantages, of reward and costs together"
         refuse_options("CostGAE", kwargs, "average_gae", "group_key", reason=reason)
         super().__init__(
-            gamma=check_share("gamma", gamma),
-            lmbda=check_share("lmbda", lmbda),
+            gamma=check_number("gamma", gamma, most=1),
+            lmbda=check_number("lmbda", lmbda, most=1),
             value_network=value_network,
             vectorized=vectorized,
             **kwargs,

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.value import TD0Estimator
 
-from torchrl_safe.objectives._checks import check_share, get_or_raise, refuse_options
+from torchrl_safe.objectives._checks import check_number, get_or_raise, refuse_options
 
 
 class CostTD0(TD0Estimator):
@@ -72,7 +72,9 @@ class CostTD0(TD0Estimator):
     ) -> None:
         reason = "costs keep their unit, in which their limits are"
         refuse_options("CostTD0", kwargs, "average_rewards", "group_key", reason=reason)
-        super().__init__(gamma=check_share("gamma", gamma), value_network=value_network, **kwargs)
+        super().__init__(
+            gamma=check_number("gamma", gamma, most=1), value_network=value_network, **kwargs
+        )
 
     def value_estimate(
         self,

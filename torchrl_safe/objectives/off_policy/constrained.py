@@ -142,7 +142,7 @@ class ConstrainedQLoss(CostValues):
         value = self._ensemble(self.cost_qvalue_network, inputs, params).get(key, None)
         if value is None:
             raise KeyError(f"cost_qvalue_network does not write the key {key!r}.")
-        expected = (*tensordict.batch_size, len(self.lagrange_multiplier))
+        expected = (*tensordict.batch_size, self.num_costs)
         if value.shape[1:] != expected:
             raise ValueError(
                 f"cost_qvalue_network must write {key!r} of shape {expected}, one column for each "
@@ -192,7 +192,7 @@ class ConstrainedQLoss(CostValues):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         cost_key = unravel_key(("next", self.tensor_keys.cost))
         cost = get_or_raise(tensordict, cost_key)
-        expected = (*tensordict.batch_size, len(self.lagrange_multiplier))
+        expected = (*tensordict.batch_size, self.num_costs)
         if cost.shape != expected:
             raise ValueError(
                 f"{cost_key!r} must have shape {expected}, one column for each cost, got "

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE, ValueEstimatorBase
 
-from torchrl_safe.objectives._checks import check_columns, check_discount, get_or_raise
+from torchrl_safe.objectives._checks import get_or_raise
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
 from torchrl_safe.objectives.on_policy.policies import actor_params, divergence
@@ -154,7 +154,7 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
             raise RuntimeError("Call start_projection before projection_loss, once in each batch.")
         tensordict = tensordict.clone(False)
         cost_advantage = get_or_raise(tensordict, self.tensor_keys.cost_advantage)
-        check_columns(cost_advantage, "multiplier", self.lagrange_multiplier)
+        self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
         improved = self._improved_policy(tensordict)
         shape = cost_advantage.shape[:-1]
         policy = self.evaluate(tensordict).joint(shape)
@@ -178,7 +178,8 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
                 "estimator must be a GAE, whose trace decay the projection needs, got "
                 f"{type(estimator).__name__}."
             )
-        check_discount(estimator.gamma)
+        if not estimator.gamma < 1:  # An episode has 1 / (1 - gamma) steps.
+            raise ValueError(f"gamma of the costs must be below 1, got {estimator.gamma.item()}.")
 
     def _cost_scale(self) -> Tensor:
         estimator = self.cost_value_estimator

@@ -9,7 +9,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives._checks import coefficients
+from torchrl_safe.objectives._checks import SMALLEST, coefficients
 from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
@@ -139,7 +139,7 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
-        sharpness = coefficients("sharpness", sharpness, num_costs, positive=True)
+        sharpness = coefficients("sharpness", sharpness, num_costs, SMALLEST)
         self.register_buffer("sharpness", sharpness.to(self.cost_critic_coeff.device))
 
     def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:

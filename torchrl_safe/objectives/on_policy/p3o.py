@@ -8,7 +8,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_safe.objectives._checks import coefficients
+from torchrl_safe.objectives._checks import SMALLEST, coefficients
 from torchrl_safe.objectives.on_policy.surrogate import CostSurrogate
 
 
@@ -103,7 +103,7 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
             cost_critic_coeff=cost_critic_coeff,
             **kwargs,
         )
-        penalty_coeff = coefficients("penalty_coeff", penalty_coeff, num_costs, positive=True)
+        penalty_coeff = coefficients("penalty_coeff", penalty_coeff, num_costs, SMALLEST)
         self.register_buffer("penalty_coeff", penalty_coeff.to(self.cost_critic_coeff.device))
 
     def penalty(self, surrogate: Tensor, scale: Tensor | float) -> Tensor:

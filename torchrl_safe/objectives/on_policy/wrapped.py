@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any, Literal
 
 from tensordict import TensorDictBase
@@ -33,11 +33,8 @@ class WrappedLoss(LossModule):
     and set there.
     """
 
-    @dataclass
-    class _AcceptedKeys(CostKeys):
-        pass
-
-    default_keys = _AcceptedKeys
+    _AcceptedKeys = CostKeys
+    default_keys = CostKeys
 
     # Its own, as that of the cost critic may differ from that of the loss.
     separate_losses = False

@@ -163,8 +163,7 @@ class CostUpdater(abc.ABC):
                 costs of other names or in another order.
         """
         self._check_state(state_dict)
-        # Not by a subclass: its options are still those from before the state.
-        self._cost_limit = CostUpdater._as_limit(self, state_dict["cost_limit"])
+        self._cost_limit = state_dict["cost_limit"].clone()
         self.pessimism = state_dict["pessimism"]
 
     def _check_state(self, state_dict: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
 from torchrl_safe._checks import check_flag, check_kind
-from torchrl_safe.objectives._checks import as_number, check_number
+from torchrl_safe.objectives._checks import SMALLEST, as_number, check_number
 from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
 # A relative violation is divided by at least this share of the limit.
@@ -58,6 +58,8 @@ class MultiplierUpdater(CostUpdater):
 
     Examples:
         >>> import torch
+        >>> from torchrl.objectives import LossModule
+        >>> from torchrl_safe.objectives import MultiplierUpdater
         >>> class Exponentiated(MultiplierUpdater):
         ...     def next_multiplier(self, multiplier, violation):
         ...         # By a factor of at most 1.22. From 0 it could not rise: at least 0.01.
@@ -178,7 +180,8 @@ class MultiplierUpdater(CostUpdater):
         To continue with another limit, set ``cost_limit`` afterwards.
 
         Raises:
-            ValueError: if the state is of another kind of updater or another number of costs.
+            ValueError: if the state is of another kind of updater, another number of costs, or
+                costs of other names or in another order.
         """
         super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
@@ -189,7 +192,7 @@ class MultiplierUpdater(CostUpdater):
 def _check_bound(bound: float | None) -> float | None:
     if bound is None or as_number(bound) == math.inf:
         return bound
-    return check_number("max_multiplier", bound, positive=True)
+    return check_number("max_multiplier", bound, SMALLEST)
 
 
 class DualAscent(MultiplierUpdater):
@@ -258,7 +261,7 @@ class DualAscent(MultiplierUpdater):
             normalize=normalize,
             cost_names=cost_names,
         )
-        lr = check_number("lr", lr, positive=True)
+        lr = check_number("lr", lr, SMALLEST)
         check_kind("parametrization", parametrization, Transform, such_as="SoftplusTransform()")
         multiplier = loss_module.lagrange_multiplier
         if not parametrization.inv(multiplier).isfinite().all():
@@ -292,6 +295,7 @@ class DualAscent(MultiplierUpdater):
         return self.parametrization(self._parameter).to(multiplier)
 
     def state_dict(self) -> dict[str, Any]:
+        """Returns the state of the updater; the multipliers are in the state of the loss."""
         return {**super().state_dict(), "optimizer": copy.deepcopy(self.optimizer.state_dict())}
 
     def _check_state(self, state_dict: dict[str, Any]) -> None:

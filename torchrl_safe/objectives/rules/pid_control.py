@@ -145,7 +145,7 @@ class PIDControl(MultiplierUpdater):
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:
         # The cost, not the violation: a new limit is not a rise of the cost. (A normalized
         # violation has no unit in which the limit could be added.)
-        limit = self.cost_limit * (not self.normalize)
+        limit = 0.0 if self.normalize else self.cost_limit
         cost = violation + limit
         previous = self.smoothed_cost.to(multiplier)
         previous = torch.where(previous.isnan(), cost, previous)

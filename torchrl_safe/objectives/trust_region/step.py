@@ -15,6 +15,7 @@ from torchrl.objectives import PPOLoss
 
 from torchrl_safe._checks import check_count, check_kind
 from torchrl_safe.objectives._checks import (
+    SMALLEST,
     as_number,
     check_episode_length,
     check_length_known,
@@ -194,7 +195,7 @@ class TrustRegionStep:
 
     @max_kl.setter
     def max_kl(self, max_kl: float) -> None:
-        self._max_kl = check_number("max_kl", max_kl, positive=True)
+        self._max_kl = check_number("max_kl", max_kl, SMALLEST)
 
     def step(self, tensordict: TensorDictBase) -> TensorDict:
         """Moves the actor once.

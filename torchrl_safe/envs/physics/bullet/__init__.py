@@ -1,4 +1,4 @@
-"""PyBullet: nothing outside this folder imports or names it."""
+"""PyBullet: nothing outside this folder imports it."""
 
 from torchrl_safe.envs.physics.bullet.inverse_kinematics import BulletInverseKinematics
 from torchrl_safe.envs.physics.bullet.physics import Bullet

@@ -1,4 +1,4 @@
-"""One simulated world. This file, ``bodies.py`` and ``readings.py`` call PyBullet."""
+"""One simulated world. This file, ``bodies.py``, ``readings.py`` and ``ruler.py`` call PyBullet."""
 
 from __future__ import annotations
 

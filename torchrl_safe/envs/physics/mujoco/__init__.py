@@ -1,4 +1,4 @@
-"""MuJoCo: nothing outside this folder imports or names it."""
+"""MuJoCo: nothing outside this folder imports it."""
 
 from torchrl_safe.envs.physics.mujoco.physics import MuJoCo
 

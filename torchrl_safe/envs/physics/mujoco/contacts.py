@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -108,14 +107,14 @@ def exclude_overlaps(spec: Any, arm: set[str], model: Any, states: Iterable[Any]
         states: states of it, with contacts, in which links may touch.
     """
     pairs = set()
-    for contacts in (data.contact for data in states):
-        touching = np.asarray(model.geom_bodyid)[contacts.geom[contacts.dist <= 0]]
+    for data in states:
+        touching = model.geom_bodyid[data.contact.geom[data.contact.dist <= 0]]
         pairs |= {tuple(sorted(model.body(i).name for i in pair)) for pair in touching}
     for body in arm:
         parent = model.body(model.body(body).parentid[0]).name
         pairs.add(tuple(sorted((body, parent))))
-    for one, other in combinations(sorted(arm), 2):
-        if (one, other) in pairs:
+    for one, other in sorted(pairs):
+        if one in arm and other in arm:
             spec.add_exclude(bodyname1=one, bodyname2=other)
 
 
@@ -135,9 +134,7 @@ def exclude_unreachable(spec: Any, arm: set[str], model: Any, data: Any, *, reac
     """
     level = level_bodies(model, data)
     for body in range(1, model.nbody):
-        joints = _joints(model, body)
-        turns = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE).all()
-        if model.body_parentid[body] not in level or not turns:
+        if model.body_parentid[body] not in level or not _only_turns(model, body):
             continue
         shapes = model.geom_bodyid == body
         radii = np.linalg.norm(model.geom_pos[shapes], axis=1) + model.geom_rbound[shapes]
@@ -155,12 +152,15 @@ def level_bodies(model: Any, data: Any) -> set[int]:
     """
     level = {0}
     for body in range(1, model.nbody):
-        joints = _joints(model, body)
-        turns = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE).all()
-        upright = (np.abs(data.xaxis[joints, 2]) > 1 - 1e-9).all()
-        if model.body_parentid[body] in level and turns and upright:
+        upright = (np.abs(data.xaxis[_joints(model, body), 2]) > 1 - 1e-9).all()
+        if model.body_parentid[body] in level and _only_turns(model, body) and upright:
             level.add(body)
     return level
+
+
+def _only_turns(model: Any, body: int) -> bool:
+    kinds = model.jnt_type[_joints(model, body)]
+    return bool((kinds == mujoco.mjtJoint.mjJNT_HINGE).all())
 
 
 def _joints(model: Any, body: int) -> slice:

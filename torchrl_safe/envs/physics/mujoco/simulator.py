@@ -353,7 +353,7 @@ class MuJoCoSimulator:
         return self._chain(joints).jacobian
 
     def clearance(self, row: int) -> float:
-        """Returns the smallest distance of obstacles from arm and objects, up to 0.1 m."""
+        """Returns how far obstacles and objects are from arm and objects, up to 0.1 m."""
         return self._clearance(self._batch.state[row], self._tracks.present[row])
 
     def nearest(self, rows: NDArray[np.int_], joints: Array, fingers: Array) -> Nearest:
