@@ -8,9 +8,16 @@ import torch
 from counting import CountingBatch, inside, with_costs
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    DTypeCastTransform,
+    ObservationNorm,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
 
-from torchrl_safe.envs import CostToReward, EarlyTermination, Saute
+from torchrl_safe.envs import ArmEnv, CostToReward, EarlyTermination, Saute
 from torchrl_safe.envs.transforms.budget import CostTally
 
 SAUTE = partial(Saute, unsafe_reward=-1.0)
@@ -145,6 +152,21 @@ def test_rewards_that_are_whole_numbers_are_refused(make_env, transform):
     env = TransformedEnv(env, CostToReward(["cost_0"])).append_transform(transform(3.0))
     with pytest.raises(ValueError, match=r"reward_key must be of floating-point numbers, got tor"):
         env.reward_spec  # noqa: B018
+
+
+@pytest.mark.parametrize("transform", [SAUTE, EarlyTermination], ids=["saute", "early"])
+def test_later_transforms_may_not_change_the_tally(make_env, transform):
+    """The next step starts from it: one that is normalized in place exceeds no budget."""
+    key = transform(1.0).out_key
+    normalize = partial(ObservationNorm, 0.5, 2.0, in_keys=[key])
+    env = make_env(lambda: TransformedEnv(ArmEnv(), transform(1.0)))
+    env.rollout(2)
+    env.append_transform(DTypeCastTransform(torch.float32, torch.float64, in_keys=[key]))
+    env.append_transform(normalize(out_keys=["normalized"]))
+    assert env.rollout(2)["normalized"].dtype == torch.float64
+    env.append_transform(Compose(StepCounter(), normalize()))
+    with pytest.raises(ValueError, match=f"out_key must not .* got {key!r} and ObservationNorm"):
+        env.rollout(2)
 
 
 def test_the_base_class_needs_its_rules():

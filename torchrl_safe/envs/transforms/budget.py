@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
+from torchrl.envs import DTypeCastTransform, Transform
 
 from torchrl_safe._checks import as_tensor, check_one_each
 
@@ -100,6 +100,7 @@ class CostTally(Transform, abc.ABC):
         return output_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
+        self._refuse_changes()
         # Batched environments hand their workers the entries that are in the state alone.
         input_spec = input_spec.clone()
         states = input_spec["full_state_spec"]
@@ -108,6 +109,20 @@ class CostTally(Transform, abc.ABC):
         self._add_tally(states, self.parent.full_reward_spec)
         input_spec["full_state_spec"] = states
         return input_spec
+
+    def _refuse_changes(self) -> None:
+        """Raises if a later transform would change the tally that the next step starts from."""
+        transforms = [m for m in self.container.transform.modules() if isinstance(m, Transform)]
+        for other in reversed(transforms):
+            if other is self:
+                return
+            changes = self.out_key in (other.out_keys or ())
+            if changes and not isinstance(other, DTypeCastTransform):
+                raise ValueError(
+                    f"out_key must not be written by a later transform, got {self.out_key!r} and "
+                    f"{type(other).__name__}: the next step would start from what it has made of "
+                    "it. Give that transform other out_keys."
+                )
 
     def _add_tally(self, specs: Composite, rewards: Composite) -> None:
         spec, folder = self._tally_spec(rewards), _folder(self.out_key)

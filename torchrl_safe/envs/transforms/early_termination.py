@@ -46,7 +46,8 @@ class EarlyTermination(CostTally):
         done_key (NestedKey, optional): Defaults to ``"done"``.
 
     Raises:
-        ValueError: if ``budget`` or ``termination_reward`` is not usable.
+        ValueError: if ``budget`` or ``termination_reward`` is not usable, or a later transform
+            writes ``out_key``: have it write another key.
         KeyError: if costs, reward or done flags are not what the environment returns, or
             ``out_key`` is already among the observations; in a step, if another transform has
             removed ``out_key``.

@@ -50,7 +50,8 @@ class Saute(CostTally):
             Defaults to ``"remaining_budget"``.
 
     Raises:
-        ValueError: if ``budget``, ``unsafe_reward`` or ``discount`` is not usable.
+        ValueError: if ``budget``, ``unsafe_reward`` or ``discount`` is not usable, or a later
+            transform writes ``out_key``: have it write another key.
         KeyError: if the costs or the reward are not among the rewards, or ``out_key`` is already
             among the observations; in a step, if another transform has removed ``out_key``.
 
