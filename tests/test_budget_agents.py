@@ -92,3 +92,12 @@ def test_the_tallies_of_agents_may_stand_in_a_group_of_their_own():
     env = TransformedEnv(Crew(ends_by_agent=False), saute)
     check_env_specs(env)
     assert env.rollout(2)["next", "budget", "left"].shape == (2, 2, 3, 2)
+
+
+def test_the_nearest_mask_begins_a_tally_anew():
+    transform = EarlyTermination(9.0, out_key=("agents", "used"))
+    own = torch.tensor([[True, False]] * 3).unsqueeze(-1)
+    data = TensorDict({"_reset": torch.ones(3, 1, dtype=torch.bool)}, [3])
+    data["agents", "_reset"], data["agents", "used"] = own, torch.ones(3, 2, 1)
+    used = transform._reset(data, TensorDict({}, [3]))["agents", "used"]
+    assert torch.equal(used, 1.0 - own.float())

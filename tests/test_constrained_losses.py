@@ -307,3 +307,20 @@ def test_values_are_reduced_as_torchrl_does(shape, key, reduction):
 def test_multipliers_are_refused_where_there_are_none(make):
     with pytest.raises(TypeError, match=r"has no multipliers, got multiplier_init=0\.5"):
         make(*make_networks(), multiplier_init=0.5)
+
+
+def test_an_advantage_norm_is_not_updated_by_minibatches():
+    updates = []
+
+    class Norm(nn.Module):
+        def scale(self):
+            return torch.tensor(2.0)
+
+        def update(self, value):
+            updates.append(value)
+
+    loss = PPOLagrangianLoss(*make_networks(2), num_costs=2, advantage_norm=Norm())
+    data = loss.estimate_advantages(make_batch(2)).reshape(-1)
+    updates.clear()
+    loss(data)
+    assert not updates

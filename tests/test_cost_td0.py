@@ -114,3 +114,11 @@ def test_widths_must_agree():
 def test_costs_keep_their_unit(name):
     with pytest.raises(ValueError, match=f"{name} is not supported by CostTD0"):
         CostTD0(gamma=0.9, **{name: True})
+
+
+def test_several_steps_in_rows_of_one():
+    batch = make_batch()
+    batch["steps_to_next_obs"] = torch.tensor([1, 1, 3])
+    expected = CostTD0(gamma=0.5).value_estimate(batch)
+    rows = CostTD0(gamma=0.5).value_estimate(batch.reshape(3, 1))
+    assert torch.equal(rows, expected.reshape(3, 1, 3))

@@ -306,3 +306,9 @@ def test_bad_arguments(make, message):
 def test_workspace_is_a_region():
     with pytest.raises(TypeError, match=r"region must be an instance of Region, got \(\(0,"):
         Workspace(((0, 0, 0), (1, 1, 1)))
+
+
+def test_the_margin_is_not_one_of_the_table():
+    far = np.full((2, 1, 1), np.inf)
+    state = make_state(trace=make_trace(clearance=far, table_distance=[[0.01], [0.0]]))
+    np.testing.assert_array_equal(Collision(margin=0.02, table=True)(state), [0, 1])

@@ -116,3 +116,10 @@ def test_each_cost_for_itself():
         for index, updater in enumerate(alone):
             updater.step(costs[:, index : index + 1])
             torch.testing.assert_close(multiplier(both)[index], multiplier(updater)[0])
+
+
+def test_it_starts_at_the_multiplier_of_the_loss():
+    updater = PIDControl(make_module(4.0), cost_limit=10.0, kp=0.0, pessimism=0.0)
+    updater.step(torch.tensor([[11.0]]))
+    expected = torch.tensor([4 * math.exp(0.1)])
+    torch.testing.assert_close(updater.loss_module.lagrange_multiplier, expected)

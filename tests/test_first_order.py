@@ -193,3 +193,30 @@ def test_a_distribution_without_a_divergence_is_named():
     one = TruncatedNormal(torch.zeros(2), torch.ones(2), low=-1.0, high=1.0)
     with pytest.raises(NotImplementedError, match="no KL divergence of TruncatedNormal"):
         divergence(one, one, torch.Size([]))
+
+
+@pytest.mark.parametrize("make", [P3OLoss, CUPLoss])
+def test_the_parts_of_a_delayed_policy_are_added_up(make):
+    """Three parts of a log-probability that are 0.1 off are one that is 0.3 off."""
+    gradients = []
+    for distribution, off in ((IndependentNormal, 0.3), (Normal, 0.1)):
+        torch.manual_seed(0)
+        net = torch.nn.Sequential(MLP(4, 6), NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictModule(net, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=distribution,
+            return_log_prob=True,
+        )
+        critics = make_critic(), make_critic("cost_value")
+        loss = make(actor, *critics, delay_actor=True, entropy_bonus=False)
+        SoftUpdate(loss, eps=0.5)
+        for name in loss.cost_buffers:
+            getattr(loss, name).fill_(2.0)
+        data = make_batch(1).exclude("action", "action_log_prob", "loc", "scale")
+        with torch.no_grad():
+            data = loss.estimate_advantages(actor(data)).reshape(-1)
+        data["action_log_prob"] += off
+        gradients.append(actor_gradient(loss, term(loss, data)))
+    assert gradients[0].norm() > 0.1
+    torch.testing.assert_close(*gradients)

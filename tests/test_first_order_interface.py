@@ -207,3 +207,19 @@ def test_crpo_wraps_any_advantage_loss():
         assert not torch.equal(loss(make_batch(2))["loss_objective"], before)
     with pytest.raises(ValueError, match="normalize_advantage=True"):
         crpo(*make_networks(), normalize_advantage=True)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (FOCOPSLoss, "temperature"),
+        (FOCOPSLoss, "kl_bound"),
+        (P3OLoss, "penalty_coeff"),
+        (IPOLoss, "sharpness"),
+        (crpo, "tolerance"),
+    ],
+)
+def test_coefficients_can_be_scheduled(make, name):
+    loss = build(make)
+    setattr(loss, name, 0.5)
+    assert getattr(loss, name) == 0.5

@@ -58,6 +58,8 @@ def test_cup_of_an_actor_without_shapes():
     loss(data)
     loss.start_projection()
     assert loss.projection_loss(data)["kl"] == 0
+    train(loss, data, 3)
+    assert loss.projection_loss(data)["kl"] > 0
 
 
 @pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])

@@ -16,7 +16,7 @@ from torchrl.modules import (
 )
 from torchrl.objectives import KLPENPPOLoss
 
-from torchrl_safe.objectives import PPOLagrangianLoss
+from torchrl_safe.objectives import CUPLoss, PPOLagrangianLoss, TrustRegionLoss
 from torchrl_safe.testing import OBSERVATION_SIZE, make_batch
 
 
@@ -214,3 +214,19 @@ def test_heads_compile_to_one_graph(name, functional):
     actual = torch.compile(loss, fullgraph=True, backend="eager")(data)
     for key, value in expected.items():
         torch.testing.assert_close(actual[key], value)
+
+
+def test_a_projection_leaves_no_features_in_the_batch():
+    loss, data = CUPLoss(*make_heads()[1], num_costs=2), minibatch()
+    before = data.clone()
+    loss.start_projection()
+    loss.projection_loss(data)
+    assert set(data.keys(True)) == set(before.keys(True))
+    assert (data == before).all()
+
+
+def test_the_critics_alone_read_features_of_this_call():
+    loss, data = TrustRegionLoss(*make_heads()[1], num_costs=2), minibatch()
+    whole = loss(data.clone())
+    for key, value in loss.critic_losses(data).items():
+        assert torch.equal(value, whole[key]), key

@@ -362,3 +362,8 @@ def test_costs_that_do_not_fit_are_refused():
     for call in (loss, loss.estimate_advantages):
         with pytest.raises(KeyError, match=r"\('next', 'cost'\)"):
             call(make_batch(3).exclude(("next", "cost")))
+
+
+def test_choosing_an_estimator_returns_the_loss():
+    loss = wrap(ClipPPOLoss)
+    assert loss.make_value_estimator(gamma=0.5) is loss

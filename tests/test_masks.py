@@ -103,3 +103,41 @@ def test_a_mask_must_be_bool():
     message = r"mask \('collector', 'mask'\) must be bool, got torch\.float32"
     with pytest.raises(ValueError, match=message):
         make_loss().estimate_advantages(batch)
+
+
+def test_rewards_that_do_not_count_may_be_nan():
+    """And costs."""
+    loss, batch = make_loss(2, multiplier_init=1.0), make_batch(2)
+    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
+    mask[0, 4:] = False
+    batch["collector", "mask"] = mask
+    expected = make_loss(2).estimate_advantages(batch.clone())
+    batch["next", "reward"][0, 4:] = batch["next", "cost"][0, 4:] = torch.nan
+    data = loss.estimate_advantages(batch)
+    for key in ("advantage", "value_target", "cost_advantage", "cost_value_target"):
+        torch.testing.assert_close(data[key], expected[key])
+    assert data["next", "reward"][0, 4:].isnan().all()  # The batch keeps its own.
+    losses = loss(data.reshape(-1))
+    sum(losses[key] for key in TRAINS).backward()
+    gradients = [p.grad for p in loss.parameters() if p.grad is not None]
+    assert gradients
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+def test_a_minibatch_of_padding_alone_teaches_nothing():
+    loss = make_loss(2)
+    data = estimated(loss, 2)
+    data["collector", "mask"] = torch.zeros(len(data), 1, dtype=torch.bool)
+    assert loss(data)["loss_cost_critic"] == 0
+
+
+def test_a_loss_without_masks_takes_padding_for_steps():
+    loss, batch = make_loss(2), make_batch(2)
+    loss.loss_mask_key = None
+    expected = loss.estimate_advantages(batch.clone())
+    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
+    mask[0, 4:] = False
+    batch["collector", "mask"] = mask
+    actual = loss.estimate_advantages(batch)
+    for key in ("value_target", "cost_value_target"):
+        assert torch.equal(actual[key], expected[key])

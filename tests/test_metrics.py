@@ -321,3 +321,14 @@ def test_bad_costs_are_refused(metric, costs, message):
 def test_bad_arguments_are_named(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_an_interval_is_one_of_means_that_were_drawn():
+    value, low, high = mean(torch.tensor([0.0] * 7 + [9.0]).unsqueeze(-1))
+    assert low == 0
+    assert high > 2 * value
+
+
+def test_an_infinite_limit_is_refused():
+    with pytest.raises(ValueError, match="cost_limit must be finite, got inf"):
+        violation_rate(torch.ones(2, 1), INF)

@@ -293,3 +293,12 @@ def test_a_state_can_be_loaded_again():
         updater.step(torch.tensor([[3.0]]))
         seen.append(updater.loss_module.lagrange_multiplier.item())
     assert seen[0] == seen[1]
+
+
+def test_a_normalizing_rule_survives_a_cast_of_the_loss():
+    loss = make_loss()
+    updater = DualAscent(loss, cost_limit=5.0, lr=1.0, normalize=True)
+    updater.step(torch.tensor([[6.0]]))
+    loss.to(torch.float64)
+    updater.step(torch.tensor([[6.0]]))
+    torch.testing.assert_close(loss.lagrange_multiplier, torch.tensor([2.0]).double())

@@ -458,3 +458,14 @@ def test_the_state_holds_its_own_limit():
     updater.load_state_dict(state)
     updater.cost_limit.fill_(9.0)
     assert state["cost_limit"].item() == 1.0
+
+
+def test_a_refused_step_leaves_the_scale_of_the_costs():
+    class Broken(MultiplierUpdater):
+        def next_multiplier(self, multiplier, violation):
+            return multiplier + torch.nan
+
+    updater = Broken(make_module(1.0), cost_limit=1.0, normalize=True)
+    with pytest.raises(ValueError, match="must return 1 finite numbers"):
+        updater.step(torch.tensor([[0.0], [9.0]]))
+    assert updater.cost_scale == 0

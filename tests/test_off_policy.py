@@ -411,3 +411,9 @@ def test_the_multiplier_is_a_buffer_and_no_parameter(kind):
     assert loss.lagrange_multiplier.tolist() == [0.5, 0.5]
     assert loss.lagrange_multiplier.data_ptr() == address
     assert losses["lagrange_multiplier_0"].item() == 1.5
+
+
+@each_loss
+def test_without_delay_there_are_no_target_cost_critics(kind):
+    loss = make_loss(kind, 2, delay_qvalue=False)
+    assert not any(name.startswith("target_cost_qvalue") for name, _ in loss.named_children())

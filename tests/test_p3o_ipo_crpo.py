@@ -241,3 +241,23 @@ def test_p3o_and_ipo_clip_with_the_range_of_ppo():
         step(narrow, [100.0])
         step(wide, [100.0])
         assert narrow(data)["loss_penalty"] > wide(data)["loss_penalty"]
+
+
+def test_each_bound_clips_on_its_side():
+    loss = build(P3OLoss, penalty_coeff=7.0, clip_epsilon=(0.1, 0.4))
+    data = estimated(loss)
+    step(loss, [100.0])
+    current, old = policy(loss, data), old_policy(data)
+    ratio = (current.log_prob(data["action"]) - old.log_prob(data["action"])).exp().unsqueeze(-1)
+    cost = data["cost_advantage"] = (1 - ratio).detach()  # All that is clipped counts.
+    assert ratio.min() < 0.9 < 1.4 < ratio.max()
+    surrogate = (torch.maximum(ratio * cost, ratio.clamp(0.9, 1.4) * cost) - cost).mean()
+    torch.testing.assert_close(loss(data)["loss_penalty"], 7 * (surrogate + 0.01 * 100))
+
+
+@pytest.mark.parametrize("kind", [P3OLoss, IPOLoss])
+def test_the_length_cannot_be_taken_away_without_discount(kind):
+    loss = build(kind, episode_length=40).make_cost_value_estimator(gamma=1.0)
+    with pytest.raises(ValueError, match="episode_length must be given"):
+        loss.episode_length = None
+    assert loss.episode_length == 40

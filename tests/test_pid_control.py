@@ -251,3 +251,8 @@ def test_the_state_of_another_number_of_costs_is_refused(updater):
 def test_bad_arguments_are_named(name, value):
     with pytest.raises(ValueError, match=rf"^{name} must .* got {value}"):
         make(**{name: value})
+
+
+def test_a_gain_that_would_overflow_is_refused():
+    with pytest.raises(ValueError, match=r"kp must be a number from 0 to 1e\+18, got 1e\+30"):
+        PIDControl(make_module(0.0), cost_limit=1.0, kp=1e30)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from first_order import actor_gradient
 from tensordict import TensorDict
 from tensordict.nn import (
     CompositeDistribution,
@@ -10,10 +11,7 @@ from tensordict.nn import (
 )
 from torch import nn
 from torch.distributions import Categorical, Normal, kl_divergence
-from torchrl.modules import (
-    IndependentNormal,
-    ProbabilisticActor,
-)
+from torchrl.modules import IndependentNormal, ProbabilisticActor, recurrent_mode
 from torchrl.objectives import PPOLoss, SoftUpdate
 from trust_region import (
     ACTORS,
@@ -41,6 +39,7 @@ from torchrl_safe.objectives import (
     TrustRegionStep,
     ViolationUpdater,
 )
+from torchrl_safe.objectives.trust_region.actor_copy import importance_weight
 from torchrl_safe.testing import (
     ACTION_SIZE,
     OBSERVATION_SIZE,
@@ -552,3 +551,71 @@ def test_the_divergence_of_a_very_small_step_is_kept_to():
 def test_a_compiled_loss_is_the_loss_itself():
     loss = make_loss()
     assert TrustRegionStep(torch.compile(loss, backend="eager"), CPO()).loss_module is loss
+
+
+def test_a_recurrent_actor_sees_whole_sequences():
+    loss = make_loss()
+    data, modes = make_data(loss), []
+    for module in loss.actor_network.modules():
+        module.register_forward_pre_hook(lambda *_: modes.append(recurrent_mode()))
+    TrustRegionStep(loss, max_kl=MAX_KL).step(data)
+    assert modes
+    assert all(modes)
+
+
+def test_the_violation_has_the_unit_of_scaled_advantages():
+    def stepped(scale=None, violation=0.2):
+        loss = make_loss()
+        loss.cost_violation.fill_(violation)
+        data = make_data(loss)
+        if scale is not None:
+            loss.cost_advantage_scale.fill_(scale)
+            data["cost_advantage"] /= scale
+        info = TrustRegionStep(loss, CPO(), max_kl=MAX_KL, episode_length=10.0).step(data)
+        assert info["constraint_active"]
+        assert not info["recovery_steps"]
+        return actor_state(loss)
+
+    expected = stepped()
+    assert not torch.allclose(stepped(violation=0.05), expected, atol=1e-4)
+    torch.testing.assert_close(stepped(scale=4.0), expected)
+
+
+def test_both_uses_of_a_tied_weight_count():
+    torch.manual_seed(0)
+    actor = ProbabilisticActor(
+        TensorDictModule(Tied().eval(), ["observation"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=Categorical,
+        return_log_prob=True,
+    )
+    loss = PPOLoss(actor, make_critic(), entropy_bonus=False, functional=False)
+    data = make_data(loss)
+    with torch.no_grad():
+        old = actor.get_dist(data.clone())
+        info = TrustRegionStep(loss, max_kl=MAX_KL).step(data)
+        kl = kl_divergence(old, actor.get_dist(data.clone())).mean()
+    assert 0 < kl <= MAX_KL
+    torch.testing.assert_close(info["kl"], kl, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("kind", [IndependentNormal, Normal])
+def test_a_capped_ratio_is_that_of_the_loss(kind):
+    """And has its gradient. A Normal has a ratio for each part of the action."""
+    torch.manual_seed(0)
+    critics = make_critic(), make_critic("cost_value")
+    loss = TrustRegionLoss(
+        normal_actor(kind), *critics, max_importance_ratio=1.1, entropy_bonus=False
+    )
+    observation = torch.randn(BATCH, OBSERVATION_SIZE)
+    data = act(loss, TensorDict(observation=observation, batch_size=[BATCH]))
+    data["advantage"], data["cost_advantage"] = torch.randn(2, BATCH, 1)
+    data["action_log_prob"] += 0.3 * torch.randn(data["action_log_prob"].shape)
+    with loss.actor_network_params.to_module(loss.actor_network):
+        policy = loss.actor_network.get_dist(data.clone())
+    weight = importance_weight(loss, policy, data, data.shape)
+    surrogate = (weight * data["cost_advantage"]).mean()
+    expected = loss.cost_surrogate_loss(data)[0]
+    torch.testing.assert_close(surrogate, expected)
+    gradients = [actor_gradient(loss, value) for value in (surrogate, expected)]
+    torch.testing.assert_close(*gradients)

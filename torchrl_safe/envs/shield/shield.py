@@ -281,8 +281,7 @@ class Shield:
                     state.obstacle_angular_velocity,
                 )
             )
-            arm = near.point - position
-            arm -= np.where(np.isfinite(near.distance), near.distance, 0.0)[..., None] * near.normal
+            arm = near.point - position  # Off its nearest point along the normal: as fast.
             speed = ((velocity + cross(spin, arm)) * near.normal).sum(axis=2)
             # An obstacle that goes away may stop at any time.
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration

@@ -249,22 +249,26 @@ class CostCritic(CostValues):
     def _with_ends(self, data: TensorDictBase, time: int) -> TensorDictBase:
         """The batch, with trajectories that end where what pads them begins.
 
-        To an estimator the padding would be what followed.
+        To an estimator the padding would be what followed, and NaN in it would reach all before.
         """
         mask = data.get(("collector", "mask"), None)
         if mask is None or self.loss_mask_key is None:
             return data
-        keys = self._end_keys()
-        done = get_or_raise(data, keys[0])
+        done_key, terminated_key, *sums = self._end_keys()
+        done = get_or_raise(data, done_key)
         mask = mask.reshape(data.shape).bool()
         last = mask & ~mask.roll(-1, time)
-        terminated = data.get(keys[1], done)  # What estimators take for it.
-        data = data.clone(False).set(keys[0], done | expanded_mask(last, done))
-        return data.set(keys[1], terminated)
+        terminated = data.get(terminated_key, done)  # What estimators take for it.
+        data = data.clone(False).set(done_key, done | expanded_mask(last, done))
+        for key in sums:
+            values = data.get(key)
+            data.set(key, torch.where(expanded_mask(mask, values), values, 0))
+        return data.set(terminated_key, terminated)
 
     def _end_keys(self) -> list[NestedKey]:
         keys = self.tensor_keys
-        return [unravel_key(("next", key)) for key in (keys.done, keys.terminated)]
+        names = keys.done, keys.terminated, keys.reward, keys.cost
+        return [unravel_key(("next", key)) for key in names]
 
     def _check_width(self, key: NestedKey, values: Tensor) -> None:
         if values.shape[-1] != self.num_costs:

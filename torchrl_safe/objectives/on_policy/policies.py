@@ -34,8 +34,7 @@ def summed(log_probs: Tensor, shape: torch.Size) -> Tensor:
 
 def _divergence(old: Distribution, new: Distribution) -> Tensor:
     if isinstance(old, Independent) and isinstance(new, Independent):
-        inner, last = _divergence(old.base_dist, new.base_dist), old.reinterpreted_batch_ndims
-        return inner.sum(tuple(range(-last, 0))) if last else inner
+        return _divergence(old.base_dist, new.base_dist)
     if isinstance(old, Categorical) and isinstance(new, Categorical):
         # PyTorch's has a gradient of NaN where a mask excludes an action from both.
         gap = torch.where(new.probs > 0, old.logits - new.logits, math.inf)

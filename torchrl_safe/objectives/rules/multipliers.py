@@ -148,9 +148,7 @@ class MultiplierUpdater(CostUpdater):
         if len(episode_cost) > 1:
             scale = torch.maximum(scale, episode_cost.std(0))
         # Under a limit of 0 costs that are all the same have no other scale.
-        scale = torch.where(scale > 0, scale, episode_cost.mean(0).abs())
-        # An infinite scale would never be forgotten.
-        return scale.clamp_max(torch.finfo(scale.dtype).max)
+        return torch.where(scale > 0, scale, episode_cost.mean(0).abs())
 
     @abc.abstractmethod
     def next_multiplier(self, multiplier: Tensor, violation: Tensor) -> Tensor:

@@ -95,7 +95,8 @@ def importance_weight(
 
     Args:
         loss (PPOLoss): gives the names of the entries, and the ``max_importance_ratio`` above
-            which a ratio is lowered to it, its gradient in proportion.
+            which a ratio is lowered to it, its gradient in proportion. As in TorchRL's losses, that
+            is the ratio of each part of an action if its log-probability has a number for each.
         distribution (Distribution): the policy in the states of the batch.
         tensordict (TensorDictBase): the batch.
         shape (torch.Size): shape of its states.
@@ -103,11 +104,11 @@ def importance_weight(
     Returns:
         The ratio, shape ``(*shape, 1)``.
     """
-    log_weight = summed(_log_ratio(loss.tensor_keys, distribution, tensordict, shape), shape)
+    log_weight = _log_ratio(loss.tensor_keys, distribution, tensordict, shape)
     if loss.max_importance_ratio is not None:
         excess = log_weight.detach() - loss.max_importance_ratio.log()
         log_weight = log_weight - excess.clamp_min(0)
-    return log_weight.exp()
+    return summed(log_weight, shape).exp()
 
 
 def _in_precision(tensor: Tensor, dtype: torch.dtype) -> Tensor:

@@ -1,0 +1,102 @@
+"""How much room the shield leaves, beside one wall, by hand."""
+
+import numpy as np
+import pytest
+from states import make_state
+
+from torchrl_safe.envs import Nearest, Shield
+from torchrl_safe.envs.shield.shield import _needed, _Pairs
+
+# Share of the room above the margin, 20 / s over 1/20 s.
+SHARE = 1 - np.exp(-1)
+
+
+class Wall:
+    """A joint, and fingers, that take as much off one distance as they move."""
+
+    def __init__(self, distance, *, other=0, fingers=0):
+        self.distance, self.other, self.fingers = distance, np.array([other]), fingers
+
+    def nearest(self, rows, angles, fingers):
+        ones = np.ones((len(rows), 1, 3))
+        moved = angles + fingers.sum(axis=1, keepdims=True)
+        jacobian = -np.ones((len(rows), 1, 1 + self.fingers))
+        point = ones * (0.3, 0, 0)
+        return Nearest(self.distance - moved, ones * (0, 1, 0), point, jacobian, self.other)
+
+    def jacobian(self, angles):
+        return np.zeros((len(angles), 6, 1))
+
+
+def shielded(world, asked=0.2, fingers=0.0, state=None, **settings):
+    one, held = np.zeros((2, 1)), np.zeros((2, world.fingers))
+    fields = {
+        "joint_position": one,
+        "joint_velocity": one,
+        "finger_position": held,
+        "joint_lower": np.array([-9.0]),
+        "joint_upper": np.array([9.0]),
+        **(state or {}),
+    }
+    shield = Shield(**{"acceleration": 1e4, **settings})
+    return shield(
+        one + asked,
+        held + fingers,
+        make_state(**fields),
+        world,
+        longest=np.array([0.2]),
+        duration=0.05,
+    )
+
+
+def test_the_table_has_a_margin_of_its_own():
+    done = shielded(Wall(0.15, other=1), margin=0.02, table=0.1)
+    np.testing.assert_allclose(done.joints, SHARE * 0.05)
+    assert not shielded(Wall(0.07, other=1), margin=0.02, table=0.1).braked.any()
+
+
+def test_what_goes_away_may_stop():
+    done = shielded(Wall(0.15), state={"obstacle_velocity": np.tile([0, -0.4, 0], (2, 1, 1))})
+    np.testing.assert_allclose(done.joints, SHARE * 0.13)
+
+
+def test_what_turns_comes_nearer():
+    """2 rad/s, 0.3 m off the axis."""
+    spin = {"obstacle_angular_velocity": np.tile([0, 0, 2.0], (2, 1, 1))}
+    done = shielded(Wall(0.15), state=spin)
+    np.testing.assert_allclose(done.joints, SHARE * 0.13 - 2 * 0.3 * 0.05)
+
+
+def test_the_table_does_not_come():
+    done = shielded(Wall(0.15, other=1), obstacle_speed=2.0)
+    np.testing.assert_allclose(done.joints, SHARE * 0.13)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_targets_keep_to_joint_limits(sign):
+    limits = {"joint_lower": np.array([-0.1]), "joint_upper": np.array([0.1])}
+    done = shielded(Wall(5.0), asked=sign * 0.2, reach=9.0, state=limits)
+    np.testing.assert_allclose(done.joints, sign * 0.1)
+
+
+def test_fingers_stay_while_it_brakes():
+    done = shielded(Wall(0.005, fingers=1), fingers=0.03)
+    assert done.braked.all()
+    np.testing.assert_array_equal(done.fingers, 0)
+
+
+def test_fingers_use_up_room_too():
+    done = shielded(Wall(0.15, fingers=1), fingers=0.01)
+    np.testing.assert_allclose(done.joints, SHARE * 0.13 - 0.01)
+
+
+def test_the_reach_is_more_than_the_margin_of_the_table():
+    with pytest.raises(ValueError, match=r"reach must be larger than .* and table = 0.4"):
+        Shield(table=0.4)
+
+
+def test_each_shape_may_use_up_what_its_nearest_pair_may():
+    zero, room = np.zeros((1, 2)), np.full((1, 2), 0.02)
+    fingers, other = np.zeros((1, 2, 0)), np.array([0, 0])
+    then = _Pairs(room, zero, zero, zero[..., None], fingers, zero, other)
+    np.testing.assert_allclose(_needed(np.array([[0.01, 0.05]]), then), [[-0.01, -0.01]])
