@@ -27,8 +27,6 @@ from torchrl_safe.objectives import (
 )
 from torchrl_safe.testing import make_batch, make_networks
 
-pytestmark = pytest.mark.integration
-
 # ---------------------------------------------------------------- the scale
 
 
@@ -252,6 +250,7 @@ def plain():
     return train()
 
 
+@pytest.mark.integration
 def test_both_limits_are_kept(plain):
     multipliers, costs = plain[-20:, :2].mean(0), plain[-20:, 3:].mean(0)
     assert (costs <= torch.tensor([0.8, 3.0])).all()
@@ -261,6 +260,7 @@ def test_both_limits_are_kept(plain):
     assert (plain[:, 3:].amax(0) > torch.tensor([0.8, 3.0])).all()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "units",
     [
