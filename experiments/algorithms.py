@@ -303,7 +303,7 @@ ALGORITHMS: dict[AlgorithmName, Algorithm] = {
         # TorchRL's target for the divergence, 0.01 a batch, is too slow to follow the multiplier.
         _wrapping(LagrangianLoss, partial(KLPENPPOLoss, dtarg=0.02)),
         # More batches, and a multiplier that does not rise before it has learnt to reach.
-        settings={"frames": 256_000, "multiplier_rate": 0.1},
+        settings={"frames": 256_000, "multiplier_rate": 0.05},
     ),
     "a2c-lagrangian": OnPolicy(
         _wrapping(LagrangianLoss, A2CLoss),
