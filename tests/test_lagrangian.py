@@ -367,3 +367,15 @@ def test_costs_that_do_not_fit_are_refused():
 def test_choosing_an_estimator_returns_the_loss():
     loss = wrap(ClipPPOLoss)
     assert loss.make_value_estimator(gamma=0.5) is loss
+
+
+def test_reset_is_that_of_the_wrapped_loss():
+    called = []
+
+    class Mine(ClipPPOLoss):
+        def reset(self):
+            called.append(self)
+
+    loss = wrap(Mine)
+    loss.reset()
+    assert called == [loss.loss_module]

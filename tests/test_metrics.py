@@ -332,3 +332,7 @@ def test_an_interval_is_one_of_means_that_were_drawn():
 def test_an_infinite_limit_is_refused():
     with pytest.raises(ValueError, match="cost_limit must be finite, got inf"):
         violation_rate(torch.ones(2, 1), INF)
+
+
+def test_a_negative_cost_ends_a_run():
+    assert longest_cost_run(column(1.0, -1.0, 1.0)).tolist() == [1]

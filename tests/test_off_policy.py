@@ -15,6 +15,7 @@ from off_policy import (
     make_kind,
     make_loss,
     make_parent,
+    networks_with_gradient,
     parameters,
 )
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -417,3 +418,11 @@ def test_the_multiplier_is_a_buffer_and_no_parameter(kind):
 def test_without_delay_there_are_no_target_cost_critics(kind):
     loss = make_loss(kind, 2, delay_qvalue=False)
     assert not any(name.startswith("target_cost_qvalue") for name, _ in loss.named_children())
+
+
+@each_loss
+def test_the_actor_loss_trains_no_critic(kind):
+    """With a multiplier: at zero a gradient would not show."""
+    loss = make_loss(kind, multiplier_init=1.0)
+    call(loss, make_transitions())["loss_actor"].backward()
+    assert networks_with_gradient(loss) == {"actor"}

@@ -261,3 +261,10 @@ def test_the_length_cannot_be_taken_away_without_discount(kind):
     with pytest.raises(ValueError, match="episode_length must be given"):
         loss.episode_length = None
     assert loss.episode_length == 40
+
+
+@pytest.mark.parametrize("kept", [-1.0, 0.0])
+def test_a_cost_of_no_size_is_lowered_if_it_alone_is_above(kept):
+    reward, cost = torch.tensor([[1.0]]), torch.tensor([[3.0, 4.0]])
+    violation, scale = torch.tensor([kept, 2.0]), torch.tensor([1.0, 0.0])
+    assert rectified_advantage(reward, cost, violation, 0.0, scale).item() == -4.0

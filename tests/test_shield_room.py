@@ -61,10 +61,13 @@ def test_what_goes_away_may_stop():
 
 
 def test_what_turns_comes_nearer():
-    """2 rad/s, 0.3 m off the axis."""
-    spin = {"obstacle_angular_velocity": np.tile([0, 0, 2.0], (2, 1, 1))}
+    """2 rad/s, 0.2 m off the axis."""
+    spin = {
+        "obstacle_position": np.tile([0.1, 0, 0], (2, 1, 1)),
+        "obstacle_angular_velocity": np.tile([0, 0, 2.0], (2, 1, 1)),
+    }
     done = shielded(Wall(0.15), state=spin)
-    np.testing.assert_allclose(done.joints, SHARE * 0.13 - 2 * 0.3 * 0.05)
+    np.testing.assert_allclose(done.joints, SHARE * 0.13 - 2 * 0.2 * 0.05)
 
 
 def test_the_table_does_not_come():
@@ -100,3 +103,56 @@ def test_each_shape_may_use_up_what_its_nearest_pair_may():
     fingers, other = np.zeros((1, 2, 0)), np.array([0, 0])
     then = _Pairs(room, zero, zero, zero[..., None], fingers, zero, other)
     np.testing.assert_allclose(_needed(np.array([[0.01, 0.05]]), then), [[-0.01, -0.01]])
+
+
+class Corner:
+    """Two joints take as much off a distance; the first moves the tool along x."""
+
+    def nearest(self, rows, angles, fingers):
+        ones = np.ones((len(rows), 1, 3))
+        distance = 0.005 - angles.sum(axis=1, keepdims=True)
+        return Nearest(distance, ones * (0, 1, 0), ones, -ones[..., :2], np.array([0]))
+
+    def jacobian(self, angles):
+        return np.eye(6, 2) * (1, 0) + np.zeros((len(angles), 1, 1))
+
+
+def test_a_pressed_arm_takes_the_shortest_way_out():
+    """Whatever its tool weighs."""
+    zero, limits = np.zeros((2, 2)), np.full(2, 9.0)
+    joints = dict.fromkeys(("joint_position", "joint_velocity"), zero)
+    state = make_state(**joints, joint_lower=-limits, joint_upper=limits)
+    shield = Shield(tool_weight=10.0, acceleration=1e4)
+    done = shield(zero, zero[:, :0], state, Corner(), longest=np.full(2, 0.2), duration=0.05)
+    assert done.braked.all()
+    np.testing.assert_allclose(done.joints, -SHARE * 0.015 / 2)
+
+
+class Bend:
+    """A joint whose distances are others, with other gradients, once it has turned."""
+
+    fingers = 0
+
+    def __init__(self, here, there, gradient):
+        self.here, self.there, self.gradient = here, np.array(there), np.array(gradient)
+
+    def nearest(self, rows, angles, fingers):
+        turned = angles != 0
+        distance = np.where(turned, self.there, self.here)
+        nothing = np.zeros((*distance.shape, 3))
+        jacobian = (turned * self.gradient)[..., None]
+        return Nearest(distance, nothing, nothing, jacobian, np.zeros(len(self.there), int))
+
+
+def test_another_step_like_this_has_to_be_safe():
+    """Slower by a third of 10 rad/s^2; where it ends there are 5 cm to stop in."""
+    done = shielded(Bend(0.01, [0.05], [-1.0]), margin=0, table=0, rate=1e3, acceleration=10)
+    brake = 10 * 0.05**2 / 3
+    stops = np.sqrt(brake**2 / 4 + 2 * brake * 0.05) - brake / 2
+    np.testing.assert_allclose(done.joints, stops + brake)
+
+
+def test_it_brakes_for_what_only_the_end_of_the_step_shows():
+    done = shielded(Bend(0.01, [-0.3, -0.3], [1.0, -1.0]), margin=0, table=0)
+    assert done.braked.all()
+    np.testing.assert_array_equal(done.joints, 0)

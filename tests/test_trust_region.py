@@ -328,3 +328,9 @@ def test_fisher_vector_product_is_that_of_the_explicit_matrix(policy):
     damped = matrix + 0.3 * torch.eye(size, dtype=torch.float64)
     for vector in torch.randn(5, size, dtype=torch.float64):
         torch.testing.assert_close(product(vector), damped @ vector)
+
+
+def test_conjugate_gradient_refuses_a_curvature_that_overflows():
+    """Each product is finite, but not what it gives along its vector."""
+    with pytest.raises(NotPositiveDefiniteError, match="got inf"):
+        conjugate_gradient(lambda vector: 1e20 * vector, torch.full((2,), 1e10))

@@ -312,3 +312,8 @@ def test_a_state_that_is_refused_changes_nothing():
     with pytest.raises(KeyError, match="max_kl"):
         step.load_state_dict(incomplete)
     assert step.state_dict() == before
+
+
+def test_a_complex_number_is_refused():
+    with pytest.raises(ValueError, match="max_kl must be a number"):
+        TrustRegionStep(make_loss(), max_kl=torch.tensor(0.1 + 0j))

@@ -619,3 +619,13 @@ def test_a_capped_ratio_is_that_of_the_loss(kind):
     torch.testing.assert_close(surrogate, expected)
     gradients = [actor_gradient(loss, value) for value in (surrogate, expected)]
     torch.testing.assert_close(*gradients)
+
+
+def test_a_step_a_little_beyond_the_bound_is_shortened():
+    """By a quarter: the first shorter one is within it."""
+    data, max_kl, found = make_data(make_loss()), 1e3, []
+    for _ in range(2):
+        info = TrustRegionStep(make_loss(), Fixed(0.1), max_kl=max_kl).step(data)
+        found.append(info["step_fraction"].item())
+        max_kl = info["kl"].item() / 1.25
+    assert found == pytest.approx([1.0, 0.8])

@@ -64,6 +64,7 @@ def rectified_advantage(
     if scale is not None:  # It is 0 for all costs until advantages are estimated.
         sizes = torch.where(scale > 0, scale, torch.inf)
         relative = torch.where((scale > 0).any(), excess / sizes, excess)
+    relative = torch.where(excess > 0, relative, -torch.inf)
     worst = cost_advantage.index_select(-1, relative.argmax().reshape(1))
     return torch.where((excess > 0).any(), -worst, advantage)
 
