@@ -281,7 +281,8 @@ class Shield:
                     state.obstacle_angular_velocity,
                 )
             )
-            arm = near.point - position  # Off its nearest point along the normal: as fast.
+            # As fast along the normal as the nearest point of the obstacle, which is on that line.
+            arm = near.point - position
             speed = ((velocity + cross(spin, arm)) * near.normal).sum(axis=2)
             # An obstacle that goes away may stop at any time.
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
