@@ -14,10 +14,11 @@ OMNISAFE_FILE := tests/with_safety_gymnasium/omnisafe.txt
 
 # What rounds differently from one processor to the next: losses, trust region, multipliers, metrics.
 NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,constrained_losses constrained_optimum cost_gae \
-	cost_td0 default_rule family first_order first_order_interface functional lagrangian learners metrics \
+	cost_td0 default_rule family first_order first_order_interface focops_and_cup functional heads lagrangian \
+	learners masks metrics p3o_ipo_crpo \
 	multi_agent multipliers multipliers_interface off_policy off_policy_interface offpolicy_optimum \
-	pid_control ppo_cases ppo_lagrangian ppo_lagrangian_interface sac_lagrangian scaling trust_region trust_region_loss trust_region_optimum \
-	trust_region_refusals trust_region_step violation))
+	pid_control ppo_cases ppo_lagrangian ppo_lagrangian_interface sac_lagrangian scaling trust_region \
+	trust_region_actors trust_region_loss trust_region_optimum trust_region_refusals trust_region_step violation))
 
 .PHONY: train test test-integration test-kernels test-slow test-wheel test-safety-gymnasium safe-gym safe-gym-grid \
 	bench-omnisafe compare suite paper sweep profile gallery bench draws attack ray docs lint format type clean
