@@ -36,29 +36,47 @@ def term(loss, data):
     return losses["loss_objective" if isinstance(loss, FOCOPSLoss) else "loss_penalty"]
 
 
+def gradient_of(make, distribution, num_actions, off=0.0, **options):
+    """Of what costs add to a loss; log-probabilities were recorded too high by ``off``."""
+    torch.manual_seed(0)
+    net = torch.nn.Sequential(MLP(4, 2 * num_actions), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(net, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=distribution,
+        return_log_prob=True,
+    )
+    critics = make_critic(), make_critic("cost_value")
+    loss = make(actor, *critics, entropy_bonus=False, **options)
+    if loss.delay_actor:
+        SoftUpdate(loss, eps=0.5)
+    for name in loss.cost_buffers:
+        getattr(loss, name).fill_(2.0)
+    data = make_batch(1).exclude("action", "action_log_prob", "loc", "scale")
+    with torch.no_grad():
+        data = loss.estimate_advantages(actor(data)).reshape(-1)
+    data["action_log_prob"] += off
+    return actor_gradient(loss, term(loss, data))
+
+
 @pytest.mark.parametrize("num_actions", [1, 3])
 @pytest.mark.parametrize(
     "make", [FOCOPSLoss, CUPLoss, P3OLoss, IPOLoss, TrustRegionLoss], ids=lambda make: make.__name__
 )
 def test_a_log_probability_of_each_part_is_added_up(make, num_actions):
     """Of the same policy, summed or not: the same gradient. Costs meet their own states."""
-    gradients = []
-    for distribution in (IndependentNormal, Normal):
-        torch.manual_seed(0)
-        net = torch.nn.Sequential(MLP(4, 2 * num_actions), NormalParamExtractor())
-        actor = ProbabilisticActor(
-            TensorDictModule(net, ["observation"], ["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=distribution,
-            return_log_prob=True,
-        )
-        loss = make(actor, make_critic(), make_critic("cost_value"), entropy_bonus=False)
-        for name in loss.cost_buffers:
-            getattr(loss, name).fill_(2.0)
-        data = make_batch(1).exclude("action", "action_log_prob", "loc", "scale")
-        with torch.no_grad():
-            data = loss.estimate_advantages(actor(data)).reshape(-1)
-        gradients.append(actor_gradient(loss, term(loss, data)))
+    gradients = [gradient_of(make, each, num_actions) for each in (IndependentNormal, Normal)]
+    assert gradients[0].norm() > 0.1
+    torch.testing.assert_close(*gradients)
+
+
+@pytest.mark.parametrize("make", [P3OLoss, CUPLoss])
+def test_the_parts_of_a_delayed_policy_are_added_up(make):
+    """Three parts of a log-probability that are 0.1 off are one that is 0.3 off."""
+    gradients = [
+        gradient_of(make, distribution, 3, off, delay_actor=True)
+        for distribution, off in ((IndependentNormal, 0.3), (Normal, 0.1))
+    ]
     assert gradients[0].norm() > 0.1
     torch.testing.assert_close(*gradients)
 
@@ -193,30 +211,3 @@ def test_a_distribution_without_a_divergence_is_named():
     one = TruncatedNormal(torch.zeros(2), torch.ones(2), low=-1.0, high=1.0)
     with pytest.raises(NotImplementedError, match="no KL divergence of TruncatedNormal"):
         divergence(one, one, torch.Size([]))
-
-
-@pytest.mark.parametrize("make", [P3OLoss, CUPLoss])
-def test_the_parts_of_a_delayed_policy_are_added_up(make):
-    """Three parts of a log-probability that are 0.1 off are one that is 0.3 off."""
-    gradients = []
-    for distribution, off in ((IndependentNormal, 0.3), (Normal, 0.1)):
-        torch.manual_seed(0)
-        net = torch.nn.Sequential(MLP(4, 6), NormalParamExtractor())
-        actor = ProbabilisticActor(
-            TensorDictModule(net, ["observation"], ["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=distribution,
-            return_log_prob=True,
-        )
-        critics = make_critic(), make_critic("cost_value")
-        loss = make(actor, *critics, delay_actor=True, entropy_bonus=False)
-        SoftUpdate(loss, eps=0.5)
-        for name in loss.cost_buffers:
-            getattr(loss, name).fill_(2.0)
-        data = make_batch(1).exclude("action", "action_log_prob", "loc", "scale")
-        with torch.no_grad():
-            data = loss.estimate_advantages(actor(data)).reshape(-1)
-        data["action_log_prob"] += off
-        gradients.append(actor_gradient(loss, term(loss, data)))
-    assert gradients[0].norm() > 0.1
-    torch.testing.assert_close(*gradients)

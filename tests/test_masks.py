@@ -9,6 +9,13 @@ from torchrl_safe.objectives import PPOLagrangianLoss
 from torchrl_safe.testing import make_batch, make_networks
 
 
+def mask_from(batch, first):
+    """A mask that leaves out what follows in the first row, from a step on."""
+    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
+    mask[0, first:] = False
+    return mask
+
+
 def test_masked_steps_do_not_count():
     loss = make_loss(2, multiplier_init=1.0)
     data = estimated(loss, 2)
@@ -21,21 +28,6 @@ def test_masked_steps_do_not_count():
         torch.testing.assert_close(losses[key], expected[key])
 
 
-def test_what_does_not_count_may_be_nan():
-    """Its losses are 0, and 0 times NaN would be NaN in the gradients."""
-    loss = make_loss(2, multiplier_init=1.0)
-    batch = make_batch(2)
-    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
-    mask[0, 4:] = False
-    batch["collector", "mask"] = mask
-    batch["next", "cost"][0, 4:] = torch.nan
-    losses = loss(loss.estimate_advantages(batch).reshape(-1))
-    sum(losses[key] for key in TRAINS).backward()
-    gradients = [p.grad for p in loss.parameters() if p.grad is not None]
-    assert gradients
-    assert all(gradient.isfinite().all() for gradient in gradients)
-
-
 @pytest.mark.parametrize("key", [("collector", "mask"), "mine"], ids=str)
 def test_advantages_are_those_of_the_steps_that_count(key):
     """A padded row gives the others what they have without it, up to the rounding of sums."""
@@ -44,10 +36,8 @@ def test_advantages_are_those_of_the_steps_that_count(key):
         loss.loss_mask_key = key
     batch = make_batch(2)
     expected = loss.estimate_advantages(batch[1:].clone())
-    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
-    mask[0] = False
     batch[0] = batch[0].apply(torch.zeros_like)
-    batch[key] = mask
+    batch[key] = mask_from(batch, 0)
     padded = loss.estimate_advantages(batch)
     for name in ("cost_advantage", "cost_value_target", "value_target"):
         torch.testing.assert_close(padded[name][1:], expected[name])
@@ -105,18 +95,24 @@ def test_a_mask_must_be_bool():
         make_loss().estimate_advantages(batch)
 
 
-def test_rewards_that_do_not_count_may_be_nan():
-    """And costs."""
-    loss, batch = make_loss(2, multiplier_init=1.0), make_batch(2)
-    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
-    mask[0, 4:] = False
-    batch["collector", "mask"] = mask
-    expected = make_loss(2).estimate_advantages(batch.clone())
-    batch["next", "reward"][0, 4:] = batch["next", "cost"][0, 4:] = torch.nan
+@pytest.mark.parametrize(("key", "first"), [(("collector", "mask"), 4), ("mine", 0)])
+def test_what_does_not_count_may_be_nan(key, first):
+    """Its losses are 0, and 0 times NaN would be NaN in the gradients."""
+
+    def make():
+        loss = make_loss(2, multiplier_init=1.0)
+        if key == "mine":
+            loss.loss_mask_key = key
+        return loss
+
+    loss, batch = make(), make_batch(2)
+    batch[key] = mask_from(batch, first)
+    expected = make().estimate_advantages(batch.clone())
+    batch["next", "reward"][0, first:] = batch["next", "cost"][0, first:] = torch.nan
     data = loss.estimate_advantages(batch)
-    for key in ("advantage", "value_target", "cost_advantage", "cost_value_target"):
-        torch.testing.assert_close(data[key], expected[key])
-    assert data["next", "reward"][0, 4:].isnan().all()  # The batch keeps its own.
+    for name in ("advantage", "value_target", "cost_advantage", "cost_value_target"):
+        torch.testing.assert_close(data[name], expected[name])
+    assert data["next", "reward"][0, first:].isnan().all()  # The batch keeps its own.
     losses = loss(data.reshape(-1))
     sum(losses[key] for key in TRAINS).backward()
     gradients = [p.grad for p in loss.parameters() if p.grad is not None]
@@ -135,9 +131,7 @@ def test_a_loss_without_masks_takes_padding_for_steps():
     loss, batch = make_loss(2), make_batch(2)
     loss.loss_mask_key = None
     expected = loss.estimate_advantages(batch.clone())
-    mask = torch.ones(*batch.shape, 1, dtype=torch.bool)
-    mask[0, 4:] = False
-    batch["collector", "mask"] = mask
+    batch["collector", "mask"] = mask_from(batch, 4)
     actual = loss.estimate_advantages(batch)
     for key in ("value_target", "cost_value_target"):
         assert torch.equal(actual[key], expected[key])

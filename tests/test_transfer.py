@@ -19,6 +19,7 @@ from worlds import step
 from experiments import transfer
 from experiments.algorithms import ALGORITHMS
 from experiments.config import suite_config
+from experiments.film import base_env
 from experiments.pilots import act, make_pilot
 from torchrl_safe.envs import (
     PANDA,
@@ -167,7 +168,7 @@ def test_each_condition_makes_an_environment(make_env, condition):
     task = SUITE["panda-pick-in-front"]
     assert transfer.applies(task, condition)
     env = make_env(transfer.make_env, task, condition, physics="mujoco", num_envs=1, seed=0)
-    arm = env.base_env if isinstance(env, TransformedEnv) else env
+    arm = base_env(env)
     rows = {
         "other engine": arm.physics == Bullet(),
         "wider obstacles": arm.obstacles.shapes[0].radius == pytest.approx(0.06),

@@ -202,7 +202,7 @@ class CostCritic(CostValues):
                 data.set(key, torch.where(expanded_mask(mask, values), values, 0.0))
         if data is not tensordict:
             hidden = [*self._shared_keys, *(unravel_key(("next", k)) for k in self._shared_keys)]
-            tensordict.update(data.exclude(*hidden, *self._end_keys()))
+            tensordict.update(data.exclude(*hidden, *self._replaced_keys()))
 
     @abc.abstractmethod
     def _next_cost_scale(self, cost_advantage: Tensor, mask: Tensor | None) -> Tensor | None:
@@ -254,7 +254,7 @@ class CostCritic(CostValues):
         mask = data.get(("collector", "mask"), None)
         if mask is None or self.loss_mask_key is None:
             return data
-        done_key, terminated_key, *sums = self._end_keys()
+        done_key, terminated_key, *sums = self._replaced_keys()
         done = get_or_raise(data, done_key)
         mask = mask.reshape(data.shape).bool()
         last = mask & ~mask.roll(-1, time)
@@ -265,7 +265,8 @@ class CostCritic(CostValues):
             data.set(key, torch.where(expanded_mask(mask, values), values, 0))
         return data.set(terminated_key, terminated)
 
-    def _end_keys(self) -> list[NestedKey]:
+    def _replaced_keys(self) -> list[NestedKey]:
+        """What :meth:`_with_ends` replaces, in a copy: the batch keeps its own."""
         keys = self.tensor_keys
         names = keys.done, keys.terminated, keys.reward, keys.cost
         return [unravel_key(("next", key)) for key in names]

@@ -64,9 +64,9 @@ def rectified_advantage(
     if scale is not None:  # It is 0 for all costs until advantages are estimated.
         sizes = torch.where(scale > 0, scale, torch.inf)
         relative = torch.where((scale > 0).any(), excess / sizes, excess)
-    relative = torch.where(excess > 0, relative, -torch.inf)
-    worst = cost_advantage.index_select(-1, relative.argmax().reshape(1))
-    return torch.where((excess > 0).any(), -worst, advantage)
+    exceeded = excess > 0
+    worst = torch.where(exceeded, relative, -torch.inf).argmax().reshape(1)
+    return torch.where(exceeded.any(), -cost_advantage.index_select(-1, worst), advantage)
 
 
 class CRPOLoss(ConstrainedLoss, WrappedLoss):

@@ -293,7 +293,6 @@ class DualAscent(MultiplierUpdater):
         return self.parametrization(self._parameter).to(multiplier)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the state of the updater; the multipliers are in the state of the loss."""
         return {**super().state_dict(), "optimizer": copy.deepcopy(self.optimizer.state_dict())}
 
     def _check_state(self, state_dict: dict[str, Any]) -> None:
