@@ -167,7 +167,7 @@ class Config:
     (dual-ascent), or nothing (fixed)."""
     multiplier_init: float = 0.0
     """Multiplier to start with."""
-    multiplier_rate: float = 0.2
+    multiplier_rate: float = 0.1
     """What a batch far above its limit adds to the multiplier."""
     limit_share: float = 1.0
     """Share of each limit that training aims at; reports have the whole limit. Less than 1 leaves a

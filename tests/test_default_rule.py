@@ -38,22 +38,25 @@ def test_pessimism_adds_standard_errors():
 
 
 @pytest.mark.parametrize("limit", [0.025, 25.0, 25_000.0])
-def test_a_limit_that_is_far_away_is_answered_within_twelve_batches(limit):
-    """From nothing to 11, by a factor of e ** 0.2 in each batch, and back at the same pace."""
+def test_a_limit_that_is_far_away_is_answered_at_the_same_pace_up_and_down(limit):
+    """To 3 in 16 batches: by 0.1 in each up to 1, by a factor of e ** 0.1 above."""
+
+    def expected(sums):
+        return pytest.approx([math.exp(s - 1) if s > 1 else max(s, 0) for s in sums], 1e-5, 1e-6)
+
     updater = make_updater(cost_limit=limit)
-    up = [step(updater, 50 * limit, 50 * limit).item() for _ in range(12)]
-    assert up == pytest.approx([math.exp(0.2 * batch) for batch in range(1, 13)])
-    # The integral is 2.4; each batch takes 0.2 off it, and the proportional part 1 off the sum.
-    sums = [1.4 - 0.2 * batch for batch in range(1, 8)]
+    up = [step(updater, 50 * limit, 50 * limit).item() for _ in range(16)]
+    assert up == expected([0.5 + 0.1 * batch for batch in range(1, 17)])
+    # The integral is 1.6; each batch takes 0.1 off it, and the proportional part 0.5 off the sum.
+    sums = [1.1 - 0.1 * batch for batch in range(1, 12)]
     down = [step(updater, 0.0, 0.0).item() for _ in sums]
-    expected = [math.exp(value - 1) if value > 1 else max(value, 0) for value in sums]
-    assert down == pytest.approx(expected, abs=1e-6)
+    assert down == expected(sums)
     assert down[-1] == 0
 
 
 def test_an_assigned_multiplier_is_where_the_next_step_starts():
     # v is 1/2, so the sum rises by 0.1 in each batch, and e ** 0.1 is the factor above 1.
-    updater = make_updater(kp=0.0)
+    updater = make_updater(kp=0.0, ki=0.2)
     for start, expected in [(0.5, 0.6), (0.95, math.exp(0.05)), (4.0, 4 * math.exp(0.1))]:
         multiplier(updater).fill_(start)
         torch.testing.assert_close(step(updater, 11.0), torch.tensor([expected]))
@@ -119,7 +122,7 @@ def test_each_cost_for_itself():
 
 
 def test_it_starts_at_the_multiplier_of_the_loss():
-    updater = PIDControl(make_module(4.0), cost_limit=10.0, kp=0.0, pessimism=0.0)
+    updater = PIDControl(make_module(4.0), cost_limit=10.0, kp=0.0, ki=0.2, pessimism=0.0)
     updater.step(torch.tensor([[11.0]]))
     expected = torch.tensor([4 * math.exp(0.1)])
     torch.testing.assert_close(updater.loss_module.lagrange_multiplier, expected)

@@ -157,8 +157,8 @@ def _make_identity() -> Transform:
 class PIDControlConfig(UpdaterConfig):
     """Configuration of :class:`~torchrl_safe.objectives.PIDControl`."""
 
-    kp: float = 1.0
-    ki: float = 0.2
+    kp: float = 0.5
+    ki: float = 0.1
     kd: float = 0.0
     smoothing: float = 0.0
     max_multiplier: float | None = 20.0

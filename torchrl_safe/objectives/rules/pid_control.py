@@ -30,11 +30,11 @@ class PIDControl(MultiplierUpdater):
 
     **Above 1 the multiplier moves by factors.** The losses weigh the reward by
     :math:`1 / (1 + \lambda)`, so from 5 to 6 changes much less than from 0 to 1. Far above the
-    limit a multiplier of 8 takes 11 batches; in steps of the same size it would take 35. The
+    limit a multiplier of 8 takes 26 batches; in steps of the same size it would take 75. The
     integral stops where :math:`\lambda` is at its bound.
 
-    **The defaults have no unit.** Far above the limit the multiplier is 1.2 after the first batch,
-    3 after six, 11 after twelve and at its bound of 20 after 15, whether costs are thousands or
+    **The defaults have no unit.** Far above the limit the multiplier is 0.6 after the first batch,
+    1 after five, 3 after 16 and at its bound of 20 after 35, whether costs are thousands or
     thousandths. It is bounded: without a bound it could grow until the reward has no weight, before
     the task is learnt. The defaults need advantages without a unit, which the losses have by
     default (``normalize_cost_advantage``).
@@ -64,8 +64,8 @@ class PIDControl(MultiplierUpdater):
 
     Keyword Args:
         cost_limit (float, Tensor or Mapping): see :class:`MultiplierUpdater`.
-        kp (float, optional): proportional gain. Defaults to ``1.0``.
-        ki (float, optional): integral gain, for each batch. Defaults to ``0.2``.
+        kp (float, optional): proportional gain. Defaults to ``0.5``.
+        ki (float, optional): integral gain, for each batch. Defaults to ``0.1``.
         kd (float, optional): derivative gain, for what the violation rose since the last batch.
             Defaults to ``0.0``.
         smoothing (float, optional): weight of the past in the moving average of the cost, from 0
@@ -91,8 +91,8 @@ class PIDControl(MultiplierUpdater):
         >>> limit = torch.tensor([25.0])
         >>> updater = PIDControl(loss, cost_limit=limit, pessimism=0.0)
         >>> updater.step(torch.tensor([[26.0], [28.0]]))  # 2 above; a fifth of 25 is 5
-        >>> loss.lagrange_multiplier  # 0.2 * 2 / 5 + 1.0 * 2 / 5
-        tensor([0.4800])
+        >>> loss.lagrange_multiplier  # 0.1 * 2 / 5 + 0.5 * 2 / 5
+        tensor([0.2400])
 
         As published, in the unit of the cost:
 
@@ -113,8 +113,8 @@ class PIDControl(MultiplierUpdater):
         loss_module: LossModule,
         *,
         cost_limit: float | Tensor | Mapping[str, float],
-        kp: float = 1.0,
-        ki: float = 0.2,
+        kp: float = 0.5,
+        ki: float = 0.1,
         kd: float = 0.0,
         smoothing: float = 0.0,
         max_multiplier: float | None = 20.0,
