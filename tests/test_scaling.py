@@ -254,7 +254,8 @@ def plain():
 def test_both_limits_are_kept(plain):
     multipliers, costs = plain[-20:, :2].mean(0), plain[-20:, 3:].mean(0)
     assert (costs <= torch.tensor([0.8, 3.0])).all()
-    assert (costs > torch.tensor([0.5, 2.0])).all()
+    # Not by far, though: more than half of each is used.
+    assert (costs > torch.tensor([0.4, 1.5])).all()
     assert multipliers.max() > 0.1
     # Without multipliers neither is.
     assert (plain[:, 3:].amax(0) > torch.tensor([0.8, 3.0])).all()
