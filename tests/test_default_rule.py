@@ -41,16 +41,16 @@ def test_pessimism_adds_standard_errors():
 def test_a_limit_that_is_far_away_is_answered_at_the_same_pace_up_and_down(limit):
     """To 3 in 16 batches: by 0.1 in each up to 1, by a factor of e ** 0.1 above."""
 
-    def expected(sums):
-        return pytest.approx([math.exp(s - 1) if s > 1 else max(s, 0) for s in sums], 1e-5, 1e-6)
+    def multipliers(sums):
+        return [math.exp(value - 1) if value > 1 else max(value, 0) for value in sums]
 
     updater = make_updater(cost_limit=limit)
     up = [step(updater, 50 * limit, 50 * limit).item() for _ in range(16)]
-    assert up == expected([0.5 + 0.1 * batch for batch in range(1, 17)])
+    assert up == pytest.approx(multipliers(0.5 + 0.1 * batch for batch in range(1, 17)))
     # The integral is 1.6; each batch takes 0.1 off it, and the proportional part 0.5 off the sum.
     sums = [1.1 - 0.1 * batch for batch in range(1, 12)]
     down = [step(updater, 0.0, 0.0).item() for _ in sums]
-    assert down == expected(sums)
+    assert down == pytest.approx(multipliers(sums), abs=1e-6)
     assert down[-1] == 0
 
 

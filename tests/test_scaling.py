@@ -200,7 +200,7 @@ class Corridor:
         return data
 
 
-def train(reward_unit=1.0, cost_unit=(1.0, 1.0), batches=60):
+def train(reward_unit=1.0, cost_unit=(1.0, 1.0), batches=80):
     """PPO-Lagrangian with tabular critics; returns each batch's multipliers, reward and costs."""
     torch.manual_seed(0)
     corridor = Corridor(reward_unit, cost_unit)
@@ -254,8 +254,7 @@ def plain():
 def test_both_limits_are_kept(plain):
     multipliers, costs = plain[-20:, :2].mean(0), plain[-20:, 3:].mean(0)
     assert (costs <= torch.tensor([0.8, 3.0])).all()
-    # Not by far, though: more than half of each is used.
-    assert (costs > torch.tensor([0.4, 1.5])).all()
+    assert (costs > torch.tensor([0.5, 2.0])).all()
     assert multipliers.max() > 0.1
     # Without multipliers neither is.
     assert (plain[:, 3:].amax(0) > torch.tensor([0.8, 3.0])).all()

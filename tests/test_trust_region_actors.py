@@ -4,11 +4,7 @@ import pytest
 import torch
 from first_order import actor_gradient
 from tensordict import TensorDict
-from tensordict.nn import (
-    CompositeDistribution,
-    TensorDictModule,
-    set_composite_lp_aggregate,
-)
+from tensordict.nn import CompositeDistribution, TensorDictModule, set_composite_lp_aggregate
 from torch import nn
 from torch.distributions import Categorical, Normal, kl_divergence
 from torchrl.modules import IndependentNormal, ProbabilisticActor, recurrent_mode
@@ -26,13 +22,7 @@ from trust_region import (
     normal_actor,
 )
 
-from torchrl_safe.objectives import (
-    CPO,
-    PCPO,
-    TRPO,
-    TrustRegionLoss,
-    TrustRegionStep,
-)
+from torchrl_safe.objectives import CPO, PCPO, TRPO, TrustRegionLoss, TrustRegionStep
 from torchrl_safe.objectives.trust_region.actor_copy import importance_weight
 from torchrl_safe.testing import (
     ACTION_SIZE,

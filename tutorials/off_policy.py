@@ -89,16 +89,16 @@ cost_critic = ValueOperator(
 # ``SACLagrangianLoss`` is TorchRL's ``SACLoss`` with limits. It compares values, not standardized
 # advantages, so here the multiplier has a unit: reward per cost. An episode earns about -2 if it
 # succeeds and -8 if it does not (metres times steps), so a contact may cost about 1. The gains of
-# the rule have the same unit. They are smaller than the defaults: in a run as short as this one,
-# the price of a contact would soon exceed everything there is to earn. The entropy bonus starts
-# small for the same reason.
+# the rule have the same unit. Its proportional gain and its bound are smaller than the defaults: in
+# a run as short as this one, the price of a contact would soon exceed everything there is to earn.
+# The entropy bonus starts small for the same reason.
 
 loss = SACLagrangianLoss(
     actor, critic, cost_critic, action_spec=env.action_spec_unbatched, alpha_init=0.05
 )
 loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
 loss.make_cost_value_estimator(gamma=GAMMA)
-updater = PIDControl(loss, cost_limit=COST_LIMIT, kp=0.3, ki=0.1, max_multiplier=2.0)
+updater = PIDControl(loss, cost_limit=COST_LIMIT, kp=0.3, max_multiplier=2.0)
 targets = SoftUpdate(loss, tau=0.01)
 optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
 
