@@ -133,10 +133,10 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
                 )
                 axis.annotate(
                     f"told to keep {limit:g}",
-                    (rows[:, 1].mean(), rows[:, 0].min()),
-                    xytext=(0, -16),
+                    (rows[:, 1].min(), rows[:, 0].max()),
+                    xytext=(-8, 3),
                     textcoords="offset points",
-                    ha="center",
+                    ha="right",
                     color=colour("ppo-lagrangian"),
                     fontweight="bold",
                     fontsize=8,
@@ -156,7 +156,7 @@ def _draw_front(axis: Axes, fixed: dict[float, np.ndarray]) -> None:
             axis.annotate(
                 f"fixed at {value:g}",
                 (cost, reward),
-                xytext=(5, 5),
+                xytext=(7, -3),
                 textcoords="offset points",
                 color=GREY,
                 fontsize=8,
