@@ -309,6 +309,20 @@ def test_components_have_names(tmp_path, net):
         RunCheckpoints(tmp_path, [net])
 
 
+@pytest.mark.parametrize(
+    ("components", "error", "message"),
+    [
+        ({}, ValueError, "components must have at least one object, got none"),
+        ({"epoch": 3}, TypeError, r"components\['epoch'\] must be .* no load_state_dict"),
+        ({"net": torch.nn.Linear}, TypeError, r"components\['net'\] must be .* a class"),
+    ],
+    ids=["none", "number", "class"],
+)
+def test_components_have_a_state(tmp_path, components, error, message):
+    with pytest.raises(error, match=message):
+        RunCheckpoints(tmp_path, components)
+
+
 def test_a_component_that_was_saved_must_be_loaded(tmp_path, net):
     RunCheckpoints(tmp_path, {"net": net, "updater": net}).save(1)
     with pytest.raises(CheckpointError, match=r"components must have \['updater'\] too, which it"):

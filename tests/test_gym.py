@@ -229,7 +229,7 @@ def test_actions_are_clipped_and_checked():
     assert np.array_equal(one, env.step(np.array([1.0, -1.0, 0.5]))[0])
     with pytest.raises(ValueError, match="action must be finite, got NaN"):
         env.step(np.array([0, np.nan, 0], np.float32))
-    with pytest.raises(ValueError, match=r"action must have shape \(1, 3\), got \(1, 4\)"):
+    with pytest.raises(ValueError, match=r"action must have shape \(3,\), got \(4,\)"):
         env.step(np.zeros(4, np.float32))
     frozen = np.zeros(3, np.float32)
     frozen.flags.writeable = False

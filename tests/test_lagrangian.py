@@ -2,6 +2,7 @@
 
 import copy
 from functools import partial
+from itertools import product
 
 import pytest
 import torch
@@ -359,9 +360,9 @@ def test_costs_that_do_not_fit_are_refused():
     loss = LagrangianLoss(A2CLoss(actor, critic), cost_critic, num_costs=2)
     with pytest.raises(ValueError, match=r"'cost'.* one column for each of the 2 costs"):
         loss(loss.estimate_advantages(make_batch(3)).reshape(-1))
-    for call in (loss, loss.estimate_advantages):
-        with pytest.raises(KeyError, match=r"\('next', 'cost'\)"):
-            call(make_batch(3).exclude(("next", "cost")))
+    for key, call in product(("cost", "reward", "done"), (loss, loss.estimate_advantages)):
+        with pytest.raises(KeyError, match=rf"\('next', '{key}'\) was not found"):
+            call(make_batch(2).exclude(("next", key)))
 
 
 def test_choosing_an_estimator_returns_the_loss():

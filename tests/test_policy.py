@@ -144,7 +144,12 @@ ACTORS = {
         )
     ),
     "attention": lambda: deterministic(
-        torch.nn.TransformerEncoderLayer(40, 4, dim_feedforward=16, batch_first=True)
+        # Among ten tokens of one observation.
+        torch.nn.Sequential(
+            torch.nn.Unflatten(-1, (10, 4)),
+            torch.nn.TransformerEncoderLayer(4, 2, dim_feedforward=16, batch_first=True),
+            torch.nn.Flatten(),
+        )
     ),
     "own-network": lambda: deterministic(Mine()),
     "discrete": categorical,
@@ -352,6 +357,13 @@ class Counting(torch.nn.Module):
         return observation[:, :3] * self.calls
 
 
+class Centred(torch.nn.Linear):
+    """One observation is centred to 0, whatever it is."""
+
+    def forward(self, observation):
+        return super().forward(observation - observation.mean(0))
+
+
 def recurrent():
     lstm = LSTMModule(40, 8, in_key="observation", out_key="features")
     return TensorDictSequential(lstm, TensorDictModule(MLP(8, 3), ["features"], ["action"]))
@@ -430,6 +442,12 @@ REFUSED = {
         {},
         ValueError,
         "actor cannot be recorded: 'aten::rand_like' is not a Core ATen operator",
+    ),
+    "together": (
+        lambda: deterministic(Centred(40, 3)),
+        {},
+        ValueError,
+        "actor must compute each action from its own observation alone, got tensor",
     ),
     "counting": (
         lambda: deterministic(Counting()),

@@ -247,6 +247,12 @@ def test_costs_of_skipped_frames_add_up(make_env):
     assert rollout["next", "cost"].flatten().tolist() == [0.25 + 0.5, 0.75 + 1, 1.25]
 
 
+@pytest.mark.parametrize("count", [0, -1, 2.5])
+def test_as_many_frames_as_can_be(count):
+    with pytest.raises(ValueError, match=f"frame_skip must be a whole number .*, got {count}"):
+        SafeGymWrapper(Counting(), frame_skip=count)
+
+
 def test_frames_of_several_environments_are_not_skipped_together():
     """When one ends, the others would lose their frames."""
     with pytest.raises(ValueError, match=r"frame_skip must be 1 for several environments, .* 4"):
@@ -428,6 +434,12 @@ def test_a_name_and_an_environment_are_told_apart():
 def test_wrong_keys(keys):
     with pytest.raises(ValueError, match="cost_keys must be a sequence of at least one key"):
         SafeGymWrapper(Counting(), cost_keys=keys)
+
+
+@pytest.mark.parametrize("key", [0, ("cost", 0), ("costs", ("speed", None)), ()], ids=repr)
+def test_keys_are_names(key):
+    with pytest.raises(ValueError, match=r"cost_keys must be strings or tuples of .*, got \[.+\]"):
+        SafeGymWrapper(Counting(), cost_keys=[key])
 
 
 def test_a_key_twice_is_refused():

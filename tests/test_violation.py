@@ -53,6 +53,8 @@ def test_pessimism_adds_standard_errors():
     assert loss.cost_violation.tolist() == [1.0, -1.0]
     with pytest.raises(ValueError, match=r"pessimism must be a number from 0 to .*, got -1"):
         ViolationUpdater(loss, cost_limit=1.0, pessimism=-1.0)
+    with pytest.raises(ValueError, match=r"pessimism must be a number from 0 to .*, got -1"):
+        updater.pessimism = -1.0
 
 
 def test_without_an_episode_nothing_changes():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -55,7 +55,9 @@ class RunCheckpoints:
             one to fall back on.
 
     Raises:
-        TypeError: if ``components`` is not a mapping.
+        TypeError: if ``components`` is not a mapping of objects with ``state_dict`` and
+            ``load_state_dict``.
+        ValueError: if it is empty.
 
     Examples:
         >>> import tempfile
@@ -80,6 +82,10 @@ class RunCheckpoints:
         keep_last: int = 2,
     ) -> None:
         check_kind("components", components, Mapping, such_as='{"loss": loss}')
+        if not components:
+            raise ValueError("components must have at least one object, got none.")
+        for name, component in components.items():
+            check_kind(f"components[{name!r}]", component, _Component)
         self.folder = Path(folder)
         # As they come back from a file: a tuple as a list.
         self.settings: dict[str, Any] = json.loads(json.dumps(settings or {}))
@@ -213,6 +219,15 @@ class RunCheckpoints:
                 )
         self._checkpoint.load(path, map_location=map_location)
         return int(path.stem.removeprefix("checkpoint-"))
+
+
+@runtime_checkable
+class _Component(Protocol):
+    """What has a state to be saved."""
+
+    def state_dict(self) -> Any: ...
+
+    def load_state_dict(self, state_dict: Any) -> Any: ...
 
 
 @dataclass(frozen=True)

@@ -177,6 +177,7 @@ def save_policy(
         TypeError: if ``path``, ``actor`` or ``observation_spec`` is not of its kind.
         ValueError: if the actor cannot be saved. It comes from :func:`load_policy`: copy the file
             instead. It reads several keys (a recurrent actor reads its state) or writes no action.
+            An action depends on the observations of other rows.
             It cannot be copied, called or recorded: Python code in it must not decide by the
             values of a tensor, as that of :class:`~torchrl.modules.TruncatedNormal` does.
 
@@ -245,7 +246,7 @@ def save_policy(
         if rows.is_floating_point():  # TorchRL draws no number where a bound is infinite.
             rows = torch.where(rows.isfinite(), rows, torch.randn_like(rows))
         try:
-            action, first = function(rows), function(rows[:1])
+            action, alone = function(rows), [function(row) for row in rows.split(1)]
         except Exception as error:
             raise ValueError(f"actor cannot be called: {error}") from error
         if not action.isfinite().all():
@@ -274,13 +275,18 @@ def save_policy(
     torch.save(contents, file)
     policy = _read(file, "actor and settings must be such that the file can be read again")
     # Python code that branches on its input is recorded with one branch only.
-    for seen, expected in ((rows, action), (rows[:1], first)):
+    for seen, expected in ((rows, action), (rows[:1], alone[0])):
         again = torch.from_numpy(policy(seen.numpy()))
-        if not torch.allclose(again.double(), expected.double(), rtol=1e-4, atol=1e-5):
+        if not _close(again, expected):
             raise ValueError(
                 "actor must compute the action in the same way from every observation, got "
                 f"{expected}, and {again} from the recorded computation."
             )
+    if not _close(torch.cat(alone), action):
+        raise ValueError(
+            "actor must compute each action from its own observation alone, got "
+            f"{torch.cat(alone)} one by one, and {action} of the same observations together."
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     with writing(path) as unfinished:
         unfinished.write(file.getbuffer())
@@ -377,6 +383,10 @@ def _observation_key(actor: TensorDictModuleBase) -> NestedKey:
 def _own(value: Any) -> Any:
     # A clone: of a view, the file would hold all that it is a view of.
     return value.detach().clone() if isinstance(value, Tensor) else value
+
+
+def _close(one: Tensor, other: Tensor) -> bool:
+    return torch.allclose(one.double(), other.double(), rtol=1e-4, atol=1e-5)
 
 
 class _Deterministic(torch.nn.Module):

@@ -40,10 +40,13 @@ class _CostBesideReward(GymWrapper):
             raise ValueError(
                 f"cost_keys must be a sequence of at least one key, got {cost_keys!r}."
             )
+        if wrong := [key for key in cost_keys if not _is_key(key)]:  # unravel_key leaves parts out.
+            raise ValueError(f"cost_keys must be strings or tuples of strings, got {wrong}.")
         keys = [unravel_key(key) for key in cost_keys]
         if len(set(keys)) < len(keys):
             raise ValueError(f"cost_keys must be different keys, got {cost_keys!r}.")
         self._cost_paths = [(key,) if isinstance(key, str) else key for key in keys]
+        check_count(frame_skip=kwargs.get("frame_skip", 1))
         super().__init__(*args, **kwargs)
 
     @property
@@ -186,6 +189,13 @@ class _CostBesideReward(GymWrapper):
         if isinstance(value, np.ndarray) and value.dtype == object:
             value = value.tolist()  # Gymnasium puts NumPy's bools and tensors into such an array.
         return check_array(name, value, self._cost.shape[:-1])
+
+
+def _is_key(key: Any) -> bool:
+    """Whether it is a string, or a tuple of strings and such tuples."""
+    if isinstance(key, tuple):
+        return bool(key) and all(map(_is_key, key))
+    return isinstance(key, str)
 
 
 def _encode(spec: TensorSpec, value: Any) -> Tensor:

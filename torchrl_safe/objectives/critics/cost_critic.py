@@ -133,7 +133,7 @@ class CostCritic(CostValues):
             ``cost_advantage`` and ``cost_value_target`` added (and both critics' values).
 
         Raises:
-            KeyError: if the batch has no cost.
+            KeyError: if the batch has no cost, reward or done.
             ValueError: if the cost critic does not write ``cost_value``, ``num_costs`` is not
                 the width of the cost, or the batch has one dimension that is not named ``"time"``.
         """
@@ -156,6 +156,8 @@ class CostCritic(CostValues):
             raise ValueError("critic_network must be given to estimate advantages, got None.")
         cost_key = unravel_key(("next", keys.cost))
         self._check_width(cost_key, get_or_raise(tensordict, cost_key))
+        for key in (keys.reward, keys.done):  # TorchRL's estimator would not name them.
+            get_or_raise(tensordict, unravel_key(("next", key)))
         written = [unravel_key(key) for key in self.cost_critic_network.out_keys]
         if unravel_key(keys.cost_value) not in written:
             raise ValueError(

@@ -58,7 +58,7 @@ class CostUpdater(abc.ABC):
         self.cost_names = check_names(cost_names, len(buffer))
         self._has_names = cost_names is not None
         self.cost_limit = cost_limit
-        self.pessimism = check_number("pessimism", pessimism)
+        self.pessimism = pessimism
 
     @property
     def cost_limit(self) -> Tensor:
@@ -68,6 +68,15 @@ class CostUpdater(abc.ABC):
     @cost_limit.setter
     def cost_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> None:
         self._cost_limit = self._as_limit(cost_limit)
+
+    @property
+    def pessimism(self) -> float:
+        """Standard errors that are added to the mean cost. You can set it."""
+        return self._pessimism
+
+    @pessimism.setter
+    def pessimism(self, pessimism: float) -> None:
+        self._pessimism = check_number("pessimism", pessimism)
 
     def _as_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> Tensor:
         """The limits, shape ``(k,)``, or an error that says why they cannot be used."""

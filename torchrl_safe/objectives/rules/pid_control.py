@@ -31,7 +31,7 @@ class PIDControl(MultiplierUpdater):
     **Above 1 the multiplier moves by factors.** The losses weigh the reward by
     :math:`1 / (1 + \lambda)`, so from 5 to 6 changes much less than from 0 to 1. Far above the
     limit a multiplier of 8 takes 26 batches; in steps of the same size it would take 75. The
-    integral stops where :math:`\lambda` is at its bound.
+    integral never exceeds what gives the bound.
 
     **The defaults have no unit.** Far above the limit the multiplier is 0.6 after the first batch,
     1 after five, 3 after 16 and at its bound of 20 after 35, whether costs are thousands or
