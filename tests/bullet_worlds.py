@@ -6,9 +6,9 @@ from torchrl_safe.envs.physics.bullet.world import World
 SCENE = Scene()
 
 
-def make_world(arm=PANDA, scene=SCENE, shapes=(), **options):
-    """A world of an arm and obstacles; with options of Bullet."""
-    return World(arm, scene, Bullet(**options), shapes)
+def make_world(arm=PANDA, scene=SCENE, shapes=(), objects=(), **options):
+    """A world of an arm, obstacles and objects; with options of Bullet."""
+    return World(arm, scene, Bullet(**options), shapes, objects)
 
 
 def worlds_of(env):

@@ -68,7 +68,9 @@ class Torque(Counting):
     def step(self, action):
         *outcome, info = super().step(action)
         pushes = action[0] > 0
-        costs = {"pushes": pushes, "torque": float(action[0]) if pushes else 0}
+        torque = float(action[0])
+        push = bool(pushes) and torque
+        costs = {"pushes": pushes, "torque": torque if pushes else 0, "push": push}
         return *outcome, {**info, "costs": costs}
 
 

@@ -17,12 +17,14 @@ from torchrl_safe.envs import (
     PANDA,
     ArmEnv,
     ArmModel,
+    Box,
     Cylinder,
     InFront,
     JointDelta,
     NoObstacles,
     Placement,
     Region,
+    Shield,
 )
 from torchrl_safe.envs.physics.scene import Scene
 
@@ -84,6 +86,15 @@ def test_closing_closes_the_world_of_the_pictures():
     assert open_clients() == before
     # Closed, not merely forgotten.
     assert env.is_closed
+
+
+def test_closing_closes_the_world_of_the_shield():
+    before = open_clients()
+    env = ArmEnv(seed=0, shield=Shield())
+    env.close()
+    # Closed, not merely forgotten.
+    assert env.is_closed
+    assert open_clients() == before
 
 
 def test_forgotten_world_is_closed():
@@ -224,16 +235,22 @@ def test_free_obstacle_falls_onto_the_table(make_env):
 
 
 def test_picture_world_takes_joints_and_poses():
-    one, two = (make_world(shapes=(Cylinder(mass=1.0),)) for _ in range(2))
+    cube = Box((0.02, 0.02, 0.02), mass=0.1)
+    one, two = (make_world(shapes=(Cylinder(mass=1.0),), objects=(cube,)) for _ in range(2))
     try:
         lying = ((0.6, 0.1, 0.05), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
-        one.reset(Placement([[0.5, 0, 0.1]]), np.zeros(3), np.zeros((0, 3)))
+        one.reset(Placement([[0.5, 0, 0.1]]), np.zeros(3), np.array([[0.4, 0.3, 0.02]]))
         one._set_joints(np.array(PANDA.home) + 0.1)
         one._place(one._obstacles[0], *lying)
+        turned = ((0.7, 0.2, 0.3), (0.0, 0.0, 0.6, 0.8))
+        one._place(one._objects[0], *turned)
         two.copy_from(one)
         assert two._joint_states() == one._joint_states() != ()
         np.testing.assert_allclose(
             np.concatenate(two._pose(two._obstacles[0])), [*lying[0], *lying[1]]
+        )
+        np.testing.assert_allclose(
+            np.concatenate(two._pose(two._objects[0])), [*turned[0], *turned[1]]
         )
         np.testing.assert_allclose([s[0] for s in two._joint_states()], np.array(PANDA.home) + 0.1)
     finally:

@@ -249,6 +249,17 @@ def test_what_could_not_be_loaded_is_not_saved(run, net):
     assert other.load() == 1
 
 
+def test_a_name_that_could_not_be_loaded_is_not_saved(run, net):
+    class Counts(torch.nn.Module):
+        def state_dict(self):
+            return {"seen": {np.int64(3): 1}}
+
+    other = RunCheckpoints(run.folder, {"counts": Counts()})
+    where = r"a key of components\['counts'\]\.state_dict\(\)\['seen'\]"
+    with pytest.raises(TypeError, match=rf"{where} must be .* of <class 'numpy.int64'>"):
+        other.save(1)
+
+
 def test_what_a_killed_process_left_is_cleared_away(run, net):
     save(run, net, 1)
     left = run.folder / ".unfinished" / "checkpoint-000000000002.torchrl"
@@ -257,6 +268,10 @@ def test_what_a_killed_process_left_is_cleared_away(run, net):
     assert run.load() == 1
     save(run, net, 2)
     assert not left.parent.exists()
+    left.parent.mkdir()
+    left.write_bytes(b"half")
+    run.clear()
+    assert not list(run.folder.iterdir())
 
 
 def test_a_run_saves_neither_before_nor_over_what_another_has_saved(run, net):
@@ -276,6 +291,16 @@ def test_a_run_saves_neither_before_nor_over_what_another_has_saved(run, net):
     other.clear()
     assert other.save(10).exists()
     assert other.load() == 10
+
+
+def test_a_run_may_save_its_own_last_step_again(run, net):
+    """As one that is resumed at its end does."""
+    save(run, net, 1)
+    save(run, net, 1)
+    resumed = RunCheckpoints(run.folder, {"net": net}, settings=run.settings)
+    assert resumed.load() == 1
+    save(resumed, net, 1)
+    assert len(list(run.folder.iterdir())) == 1
 
 
 def test_what_was_skipped_is_removed_by_the_next_save(run, net):

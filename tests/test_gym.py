@@ -128,6 +128,13 @@ def test_arguments_of_make_override():
     env.close()
 
 
+def test_costs_add_up():
+    env = ArmGymEnv(costs={"one": lambda state: np.ones(1), "two": lambda state: 2 * np.ones(1)})
+    env.reset()
+    assert env.step(np.zeros(3, np.float32))[-1]["cost"] == 3
+    env.close()
+
+
 def test_physics_is_an_argument():
     """Of every name; the same goals and obstacles, in another engine."""
     seen = []

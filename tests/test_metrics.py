@@ -298,6 +298,8 @@ def test_bad_costs_are_refused(metric, costs, message):
         (partial(share, torch.zeros(0, 1, dtype=torch.bool)), "true must not be empty"),
         (partial(share, column(True), confidence=1.0), "confidence must be .* got 1.0"),
         (partial(mean, column(1.0, 2.0), confidence=NAN), "confidence must be .* got nan"),
+        (partial(mean, column(1.0, 2.0), seed=-1), "seed must be .* got -1"),
+        (partial(mean, column(1.0, 2.0), seed=0.5), "seed must be .* got 0.5"),
         (partial(mean, column(1.0, 2.0), resample="runs"), "resample must be .* got 'runs'"),
         (partial(mean, column(1.0)), r"at least 2 episodes .* got shape \(1, 1\)"),
         (partial(mean, column(1.0, 2.0), resample="seeds"), r"at least 2 seeds .* \(2, 1\)"),

@@ -1,6 +1,7 @@
 """What only MuJoCo's worlds do: they are rows of numbers that can be written, saved and shared."""
 
 import os
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import torch
 from programs import run_code
 from tensordict import TensorDict
-from worlds import Places, each_arm, rest, step
+from worlds import Places, each_arm, rest, step, turn
 
 from torchrl_safe.envs import (
     IIWA,
@@ -238,6 +239,22 @@ def test_absent_bodies_stay_away(make_env):
     assert (env._simulator._qpos[:, env._simulator._free._position[:, 2]] < -99).all()
 
 
+def test_a_turned_body_spins_about_axes_of_the_world(make_env):
+    """MuJoCo has the spin in the frame of the body, whose x axis here points along y."""
+    quarter = [[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]]
+    layout = Places(Box(mass=1.0), at=[(0.6, 0.3, 0.5)], orientation=quarter)
+    settings = {"obstacles": layout, "scene": Scene(gravity=0.0), "frame_skip": 1, "seed": 0}
+    env = make_env(ArmEnv, physics=ONE, **settings)
+    env.reset()
+    env._simulator._qvel[0, env._simulator._free._velocity[0, 3:]] = (2.0, 0.0, 0.0)
+    rest(env)
+    state = env.arm_state
+    np.testing.assert_allclose(state.obstacle_angular_velocity, [[[0, 2, 0]]], atol=1e-3)
+    # About y: what is up turns towards x, by 2 / 240.
+    up = turn(state.obstacle_orientation[0, 0], np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(up, [2 / 240, 0, 1], atol=1e-4)
+
+
 def test_fingers_that_no_action_moves_are_not_driven(make_env):
     """Free, and without a motor they are moved by the hand; driven again, they do as told."""
     simulator = ONE.build(PANDA, Scene(free_fingers=True), num_envs=1)
@@ -279,6 +296,31 @@ def test_links_that_cannot_reach_the_table_are_not_tested_against_it(arm, links)
         for link in links:
             for geom in np.flatnonzero(model.geom_bodyid == model.body(link).id).tolist():
                 assert mujoco.mj_geomDistance(model, data, table, geom, 1.0, None) > CONTACT_RANGE
+
+
+def test_twice_the_mass_of_the_links_is_twice_in_all_that_follows_from_it():
+    """And what is beside the arm weighs what it did."""
+    one, two = (
+        build_world(PANDA, Scene(link_mass=factor), (Box(mass=1.0),), (), Sensing()).model
+        for factor in (1.0, 2.0)
+    )
+    factor = np.array([[1.0 if "obstacle" in one.body(i).name else 2.0] for i in range(one.nbody)])
+    for name in ("body_mass", "body_inertia", "body_subtreemass"):
+        before, after = (getattr(model, name).reshape(model.nbody, -1) for model in (one, two))
+        # But for the world, which is above both.
+        np.testing.assert_allclose(after[1:], (factor * before)[1:], err_msg=name)
+
+
+def test_a_smooth_link_slips_on_what_is_rough(turntable):
+    """Frictions of 0.2 and 0.5 are multiplied, as in Bullet; MuJoCo alone would take the larger."""
+    file = Path(turntable["arm"].urdf)
+    smooth = '<link name="bar"><contact><lateral_friction value="0.2"/></contact>'
+    file.write_text(file.read_text().replace('<link name="bar">', smooth))
+    world = build_world(turntable["arm"], Scene(), (Sphere(0.1),), (), Sensing())
+    data = mujoco.MjData(world.model)
+    data.mocap_pos[0] = (0.3, 0.14, 0.5)
+    mujoco.mj_forward(world.model, data)
+    np.testing.assert_allclose(data.contact.friction[:, 0], [0.2 * 0.5])
 
 
 @each_arm

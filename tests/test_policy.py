@@ -207,6 +207,15 @@ def test_the_actor_of_a_loss(name, tmp_path):
     np.testing.assert_allclose(actions, expected, rtol=1e-5, atol=1e-6)
 
 
+def test_a_file_holds_weights_once_and_nothing_else(tmp_path):
+    """Not all that a weight is a view of."""
+    net = torch.nn.Linear(40, 2000)
+    net.register_buffer("shift", torch.zeros(10**6)[:5])
+    save_policy(tmp_path / "policy.pt", deterministic(net), SPEC)
+    weights = 4 * (40 * 2000 + 2000 + 5)
+    assert weights < (tmp_path / "policy.pt").stat().st_size < 1.3 * weights
+
+
 def test_nested_keys_and_other_types(tmp_path):
     module = TensorDictModule(mlp().double(), [("arm", "state")], [("arm", "motor")])
     spec = Composite(arm=Composite(state=Unbounded(40, dtype=torch.float64)))

@@ -1,12 +1,23 @@
 """What ArmEnv draws, and the cameras it is seen by."""
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
 from torchrl.record import PixelRenderTransform
-from worlds import step
+from worlds import Places, step
 
-from torchrl_safe.envs import ArmEnv, Bullet, Camera, MuJoCo, NoObstacles
+from torchrl_safe.envs import (
+    ArmEnv,
+    Box,
+    Bullet,
+    Camera,
+    MuJoCo,
+    NoObstacles,
+    Reach,
+    Region,
+    Sphere,
+)
 
 both_engines = pytest.mark.usefixtures("engine")
 
@@ -94,3 +105,46 @@ def test_pictures_show_the_arm_and_the_target(make_env):
     changed = (env.render(width=96, height=96).int() - before.int()).abs().sum(-1) > 60
     assert changed[0].sum() > 200
     assert changed[1].sum() < 20
+
+
+@both_engines
+@pytest.mark.parametrize("field_of_view", [45.0, 22.5])
+def test_where_a_camera_shows_the_target(make_env, field_of_view):
+    """From above, x is up and y to the left; how far from the middle, by hand."""
+    goal = (0.6, 0.2, 0.1)
+    env = make_env(ArmEnv, task=Reach(Region(goal, goal)), obstacles=NoObstacles(), seed=0)
+    env.reset()
+    camera = Camera((0.5, 0.1, 1.5), (0.5, 0.1, 0.0), field_of_view)
+    red, green, blue = env.render(160, 120, camera)[0].int().unbind(-1)
+    marked = ((green > red + 50) & (green > blue + 20)).nonzero() + 0.5
+    # 0.1 m of the 1.4 m tan(fov / 2) between the middle and the edge.
+    apart = 60 * 0.1 / (1.4 * np.tan(np.radians(field_of_view / 2)))
+    np.testing.assert_allclose(marked.mean(0), [60 - apart, 80 - apart], atol=1)
+
+
+@both_engines
+def test_obstacles_are_drawn_as_they_are_turned(make_env):
+    """A bar along y, by a quarter of a turn along x, which is up in the picture from above."""
+    quarter = [[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]]
+    layout = Places(Box((0.02, 0.15, 0.02)), at=[(0.6, 0.3, 0.1)], orientation=quarter)
+    env = make_env(ArmEnv, obstacles=layout, seed=0)
+    env.reset()
+    camera = Camera((0.6, 0.3, 1.0), (0.6, 0.3, 0.0))
+    red, green, blue = env.render(80, 80, camera)[0, 20:60, 20:60].int().unbind(-1)
+    dark = ((red < 80) & (green < 90) & (blue > red + 5)).nonzero().float()
+    height, width = dark.std(0)
+    assert height > 3 * width
+
+
+@both_engines
+def test_only_what_is_touched_lights_up(make_env, turntable):
+    """Each world for itself: the bar turns into the ball in the first, and rests in the second."""
+    turntable["obstacles"] = Places(Sphere(0.1), at=[(0.45, 0.16, 0.5)])
+    env = make_env(ArmEnv, **turntable, num_envs=2)
+    env.reset()
+    cost = step(env, [[1.0], [0.0]])["cost"]
+    assert cost.flatten().tolist() == [1, 0]
+    red, green, blue = env.render(80, 60).int().unbind(-1)
+    lit = ((red > 3 * green) & (red > 3 * blue)).sum((1, 2))
+    assert lit[0] > 20
+    assert lit[1] == 0

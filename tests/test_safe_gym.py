@@ -277,6 +277,13 @@ def test_an_argument_that_no_constructor_takes_is_an_error():
         SafeGymEnv("counting:WithoutConstructor-v0", steps=3)
 
 
+def test_actions_may_have_gradients(make_env):
+    env = make_env(SafeGymWrapper, Counting())
+    action = env.rand_action()["action"].requires_grad_()
+    after = env.step(env.reset().set("action", action))
+    assert after["next", "cost"].tolist() == [0.25]
+
+
 def test_other_info_can_still_be_read(make_env):
     class Flag(Counting):
         def info(self):
@@ -292,6 +299,19 @@ def test_other_info_can_still_be_read(make_env):
     same_step.set_info_dict_reader(reader)
     rollout = same_step.rollout(5, break_when_any_done=False)
     assert rollout["next", "twice"].tolist() == [[2, 4, 6, 2, 4], [2, 4, 6, 8, 2]]
+
+
+def test_info_may_hold_arrays(make_env):
+    class Placed(Counting):
+        def info(self):
+            return {**super().info(), "place": self.count + np.arange(3.0)}
+
+    env = make_env(SafeGymWrapper, vector(AutoresetMode.SAME_STEP, partial(Placed, 3), Placed))
+    reader = default_info_dict_reader(["place"], spec=[Unbounded((2, 3), dtype=torch.float64)])
+    env.set_info_dict_reader(reader)
+    places = env.rollout(5, break_when_any_done=False)["next", "place"]
+    count = torch.tensor([[1, 2, 3, 1, 2], [1, 2, 3, 4, 1]])
+    assert torch.equal(places, count.unsqueeze(-1) + torch.arange(3.0, dtype=torch.float64))
 
 
 def summed(env):
@@ -382,7 +402,7 @@ class Returns(Counting):
         return {"cost": self.value}
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), None])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), None])
 def test_cost_must_be_finite(make_env, value):
     with pytest.raises(ValueError, match=r"cost 'cost' must be (finite|numbers)"):
         make_env(SafeGymWrapper, Returns(value)).rollout(1)
@@ -405,12 +425,12 @@ def test_rows_may_report_costs_of_other_types(make_env, forked_workers, asynchro
     env = make_env(
         SafeGymEnv,
         "counting:Torque-v0",
-        cost_keys=[("costs", "pushes"), ("costs", "torque")],
+        cost_keys=[("costs", "pushes"), ("costs", "torque"), ("costs", "push")],
         num_envs=2,
         asynchronous=asynchronous,
     )
     after = env.step(env.reset().set("action", torch.tensor([[-0.5], [0.5]])))
-    assert after["next", "cost"].tolist() == [[0, 0], [1, 0.5]]
+    assert after["next", "cost"].tolist() == [[0, 0, 0], [1, 0.5, 0.5]]
 
 
 @by_mode

@@ -185,6 +185,27 @@ def test_what_a_cost_gets_for_what_it_asks(make_env, sensing, measured):
             Trace()[name]
 
 
+def test_what_is_measured_alone_is_measured_alike(make_env):
+    """Of the same substeps, whatever else is measured."""
+
+    def traces(sensing):
+        class Mine:
+            def __call__(self, state):
+                return np.zeros(len(state.time))
+
+        Mine.sensing = sensing
+        env = make_env(ArmEnv, costs={"mine": Mine()}, seed=0)
+        env.reset()
+        step(env, [1.0, 0.5, -0.5])
+        return env.arm_state.trace
+
+    alone = [{"joints": True}, {"tool": True}, {"links": True}, {"clearance": 0.4}]
+    together = traces(Sensing(0.4, joints=True, tool=True, links=True))
+    for asked in alone:
+        for name, values in traces(Sensing(**asked)).items():
+            np.testing.assert_allclose(values, together[name], atol=1e-9, err_msg=name)
+
+
 def test_costs_share_what_is_measured(make_env):
     """The widest range of all, and a plain function may read it too."""
 
@@ -233,6 +254,38 @@ def test_clearance_is_a_distance_between_surfaces(make_env, turntable, centre, e
         clearance = env.arm_state.trace["clearance"]
         np.testing.assert_allclose(clearance, np.full((1, 12, 1), expected), atol=5e-4)
         assert cost in (None, pytest.approx(max(0, 0.45 - expected), abs=5e-4))
+
+
+def test_what_just_touches_is_at_a_distance_of_zero(make_env, turntable):
+    """A box is put down on the bar, where exact numbers make it neither overlap nor hover."""
+
+    def path(times):
+        height = np.where(times > 0, 0.645, 0.7)
+        way = np.stack([np.full_like(times, 0.25), np.zeros_like(times), height], -1)
+        return way[:, None], np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1, 1))
+
+    turntable["obstacles"] = Places(Box((0.125,) * 3), at=[(0.25, 0, 0.7)], path=path)
+    env = make_env(ArmEnv, **turntable, costs={"near": Proximity(margin=0.9)})
+    env.reset()
+    rest(env)
+    np.testing.assert_allclose(env.arm_state.trace["clearance"], 0, atol=5e-4)
+
+
+def test_clearance_is_negative_where_they_overlap(make_env, turntable):
+    """A ball goes 2 cm towards the end of the bar, and 2 cm into it."""
+
+    def path(times):
+        way = np.array([0.621, 0.0, 0.5]) - times[:, None, None] * (0.4, 0, 0)
+        return way, np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1, 1))
+
+    turntable["obstacles"] = Places(Sphere(0.1), at=[(0.621, 0, 0.5)], path=path)
+    env = make_env(ArmEnv, **turntable, costs={"apart": SpeedAndSeparation()})
+    env.reset()
+    clearances = []
+    for _ in range(2):
+        rest(env)
+        clearances += env.arm_state.trace["clearance"][0, :, 0].tolist()
+    np.testing.assert_allclose(clearances, 0.021 - 0.4 * np.arange(1, 25) / 240, atol=5e-4)
 
 
 @pytest.mark.parametrize("gap", [0.015, 0.025])
@@ -441,6 +494,20 @@ def test_weight_is_a_force(make_env, turntable):
     assert (np.abs(env.arm_state.contact_distance) < 2e-3).all()
     assert result["cost"].tolist() == [[1, 0]]
     assert (np.abs(env.arm_state.obstacle_velocity) < 1e-3).all()
+
+
+def test_the_largest_force_of_a_step_counts(make_env, turntable):
+    """2 kg that fall 3 cm are stopped within some substeps, in the middle of a control step."""
+    turntable["obstacles"] = Places(Box((0.04,) * 3, mass=2.0), at=[(0.15, 0, 0.59)])
+    env = make_env(ArmEnv, **turntable)
+    env.reset()
+    forces = []
+    for _ in range(12):
+        rest(env)
+        forces.append(env.arm_state.contact_force.item())
+    assert forces[0] == 0
+    assert forces[1] > 5 * forces[-1]
+    assert forces[-1] == pytest.approx(2 * 9.81, rel=0.02)
 
 
 def test_effort_limits_the_force(make_env, turntable):

@@ -92,6 +92,43 @@ def test_both_engines_measure_the_same(arm):
         np.testing.assert_allclose(bullet, mujoco, atol=2.5e-3)
 
 
+@pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
+def test_the_way_out_of_an_overlap(turntable, physics):
+    """A ball reaches 1 cm into the side of the bar, which has to turn by 1 cm / 0.3 m out of it."""
+    arm = turntable["arm"]
+    simulator = physics.build(arm, Scene(), num_envs=1, shapes=(Sphere(0.1),), reach=0.3)
+    placement = Placement([[0.3, 0.14, 0.5]])
+    simulator.reset(0, placement, np.zeros(3), np.zeros((0, 3)))
+    near = simulator.nearest(np.arange(1), np.zeros((1, 1)), np.zeros((1, 0)))
+    pair = near.distance[0].argmin()
+    assert near.distance[0, pair] == pytest.approx(-0.01, abs=1e-3)
+    np.testing.assert_allclose(near.normal[0, pair], [0, -1, 0], atol=1e-3)
+    assert near.jacobian[0, pair, 0] == pytest.approx(-0.3, abs=1e-3)
+    simulator.close()
+
+
+@pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
+def test_what_just_touches_is_near(turntable, physics):
+    """A box of exact numbers lies on the bar."""
+    arm, box = turntable["arm"], Box((0.125,) * 3)
+    simulator = physics.build(arm, Scene(), num_envs=1, shapes=(box,), reach=0.3)
+    simulator.reset(0, Placement([[0.25, 0.0, 0.645]]), np.zeros(3), np.zeros((0, 3)))
+    near = simulator.nearest(np.arange(1), np.zeros((1, 1)), np.zeros((1, 0)))
+    assert near.distance.min() == pytest.approx(0, abs=5e-4)
+    simulator.close()
+
+
+@pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
+def test_what_cannot_sink_is_not_measured_against_the_table(turntable, physics):
+    """No joint could change it, and below the margin it would hold the arm for ever."""
+    simulator = physics.build(turntable["arm"], Scene(), num_envs=1, shapes=(Sphere(),), reach=1.0)
+    simulator.reset(0, Placement([[0.8, 0.0, 0.5]]), np.zeros(3), np.zeros((0, 3)))
+    near = simulator.nearest(np.arange(1), np.zeros((1, 1)), np.zeros((1, 0)))
+    assert np.isfinite(near.distance[:, near.other == 0]).any()
+    assert not np.isfinite(near.distance[:, near.other == 1]).any()
+    simulator.close()
+
+
 def test_measuring_changes_nothing(make_env, engine):
     """And is only done where somebody wants it."""
     plain, measured = (make_env(ArmEnv, seed=0, shield=shield) for shield in (None, Shield()))

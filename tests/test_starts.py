@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 from draws import misses, tool_at_home
-from worlds import Places
+from worlds import ENGINES, Places
 
 from torchrl_safe.envs import (
     ArmEnv,
@@ -18,6 +18,8 @@ from torchrl_safe.envs import (
     Push,
     Reach,
     Region,
+    Scene,
+    Sphere,
 )
 from torchrl_safe.envs.generators import pack, unpack
 from torchrl_safe.envs.gym import ARMS, OBSTACLES, TASKS, combination
@@ -158,6 +160,17 @@ def test_objects_do_not_overlap_the_arm_or_each_other(places):
     """They would be thrown away, at more than a metre a second."""
     with pytest.raises(ValueError, match=r"free the arm at home and the objects, got an over"):
         ArmEnv(task=Stacked(*places), obstacles=NoObstacles())
+
+
+@pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
+@pytest.mark.parametrize(("gap", "expected"), [(0.05, 0.05), (0.2, 0.1), (-0.02, -0.02)])
+def test_clearance_is_measured_up_to_ten_centimetres(turntable, physics, gap, expected):
+    """Between a ball and the end of the bar."""
+    simulator = physics.build(turntable["arm"], Scene(), num_envs=1, shapes=(Sphere(0.2),))
+    placement = Placement([[0.7 + gap, 0.0, 0.5]])
+    simulator.reset(0, placement, np.zeros(3), np.zeros((0, 3)))
+    assert simulator.clearance(0) == pytest.approx(expected, abs=1e-3)
+    simulator.close()
 
 
 def test_what_hardly_ever_fits_is_refused():

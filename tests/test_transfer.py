@@ -6,15 +6,17 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
+import pybullet
 import pytest
 import torch
+from bullet_worlds import worlds_of
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import MLP
-from worlds import step
+from worlds import rest, step
 
 from experiments import transfer
 from experiments.algorithms import ALGORITHMS
@@ -35,6 +37,7 @@ from torchrl_safe.envs import (
     MuJoCo,
     NoObstacles,
     PickAndPlace,
+    Push,
     Scene,
     Sphere,
 )
@@ -70,6 +73,23 @@ def test_the_same_motors_move_heavy_links_less(make_env):
     way = {mass: moved(make_env, link_mass=mass, **weak) for mass in (0.5, 1.0, 4.0)}
     assert way[4.0] < 0.5 * way[1.0]
     assert way[1.0] < way[0.5]
+
+
+def test_friction_is_a_factor_of_that_between_two(make_env, engine):
+    """A cube that is let go at a speed goes on for v^2 / (2 mu g); mu is 0.25 by default."""
+    scene = Scene(friction=0.5)
+    env = make_env(ArmEnv, task=Push(), obstacles=NoObstacles(), scene=scene, seed=0)
+    env.reset()
+    before, simulator = env.arm_state.object_position, env._simulator
+    if engine == "bullet":
+        (world,) = worlds_of(env)
+        client = world._client
+        pybullet.resetBaseVelocity(world._objects[0], (0.5, 0, 0), physicsClientId=client)
+    else:
+        simulator._qvel[0, simulator._objects._velocity[0, 0]] = 0.5
+    rest(env, 15)
+    way = env.arm_state.object_position - before
+    np.testing.assert_allclose(way, [[[0.5**2 / (2 * 0.125 * 9.81), 0, 0]]], atol=8e-3)
 
 
 @pytest.mark.usefixtures("engine")

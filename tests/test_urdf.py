@@ -18,10 +18,13 @@ from torchrl_safe.envs import (
     Placement,
     Reach,
     Region,
+    Scene,
+    Sensing,
 )
 from torchrl_safe.envs.arms.urdf import find_urdf, prepare_urdf
 from torchrl_safe.envs.gym import ARMS
 from torchrl_safe.envs.physics.mujoco.meshes import read_meshes
+from torchrl_safe.envs.physics.mujoco.model import build_world
 
 
 def arm(path, ee_link, gripper=None):
@@ -398,6 +401,19 @@ def test_a_mesh_without_faces_is_refused(tmp_path):
         read_meshes(root)
 
 
+def test_corners_may_be_counted_from_the_last(tmp_path):
+    """As some programs write them, here after three of four corners."""
+    read = []
+    for faces in ("f 1 3 2\nv 0 0 1\nf 1 2 4", "f -3//1 -1//1 -2//1\nv 0 0 1\nf -4/9 -3/9 -1/9"):
+        (tmp_path / "shape.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n{faces}\n")
+        root = ElementTree.fromstring(
+            "<robot><link><collision><geometry>"
+            f"<mesh filename='{tmp_path}/shape.obj'/></geometry></collision></link></robot>"
+        )
+        read.append(read_meshes(root))
+    assert read[0] == read[1]
+
+
 @pytest.mark.usefixtures("engine")
 def test_meshes_are_read_as_others_write_them(make_chain, tmp_path):
     """By a URL, with tabs, and with a comment in another encoding."""
@@ -406,3 +422,32 @@ def test_meshes_are_read_as_others_write_them(make_chain, tmp_path):
     (tmp_path / "s.obj").write_bytes(b"# Gr\xfc\xdfe\n" + "\n".join(lines).encode())
     env = make_chain(joint(2), shape=f"<mesh filename='file://{tmp_path}/s.obj'/>")
     assert env.rollout(2)["next", "observation"].isfinite().all()
+
+
+def solid(shape, xyz="0 0 0", rpy="0 0 0"):
+    return f'<collision><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{shape}</geometry></collision>'
+
+
+ROD, BALL = '<cylinder radius="0.1" length="0.6"/>', '<sphere radius="0.1"/>'
+
+
+@pytest.mark.parametrize(
+    ("solids", "sides"),
+    [
+        ([solid(ROD)], (0.2, 0.2, 0.6)),
+        # Along the diagonal of x and z: both its length and its width show in both.
+        ([solid(ROD, rpy="0 0.7853981633974483 0")], (0.8 * 0.5**0.5, 0.2, 0.8 * 0.5**0.5)),
+        ([solid(BALL, "0.3 0 0"), solid(BALL, "-0.1 0 0")], (0.6, 0.2, 0.2)),
+        ([solid('<box size="0.2 0.4 0.6"/>', rpy="1.5707963267948966 0 0")], (0.2, 0.6, 0.4)),
+    ],
+    ids=["cylinder", "tilted-cylinder", "two-spheres", "turned-box"],
+)
+def test_mujocos_inertia_is_that_of_the_box_around_the_shapes(tmp_path, solids, sides):
+    """By hand: a twelfth of 0.5 kg times the squares of the two other sides."""
+    before, after = link("l1").split("<collision>")[0], "</link>"
+    turns = before + "".join(solids) + after
+    urdf = make_urdf(tmp_path / "chain.urdf", link("l0"), turns, joint(1))
+    arm = ArmModel(urdf, "l1", home=(0.0,))
+    model = build_world(arm, Scene(), (), (), Sensing()).model
+    square = np.square(sides)
+    np.testing.assert_allclose(model.body("l1").inertia, 0.5 / 12 * (square.sum() - square))

@@ -165,10 +165,11 @@ def nearest(closest: Array, motions: Array, ways: Ways) -> dict[str, Array]:
     # Where they overlap, the two points have changed sides.
     inwards = position[:, None] - closest[..., 1, :]
     apart = np.where(np.einsum("...i,...i->...", inwards, way) < 0, -apart, apart)
-    apart = np.where(apart == 0, np.inf, apart)
+    apart = np.where(closest.any(axis=(-2, -1)), apart, np.inf)
     rows, shape = np.arange(len(apart)), apart.argmin(axis=1)
     clearance = apart[rows, shape]
-    normal = way[rows, shape] / clearance[:, None]
+    # Of a mere touch it is unknown, and all approaches are 0.
+    normal = way[rows, shape] / np.where(clearance == 0, 1.0, clearance)[:, None]
     on_arm, on_obstacle = np.moveaxis(closest[rows, shape], 1, 0)
     centre, moving, turning = np.moveaxis(motions[rows, shape], 1, 0)
     arm = moving + cross(turning, on_arm - centre)

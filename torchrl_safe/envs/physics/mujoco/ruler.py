@@ -133,11 +133,11 @@ class Ruler:
         ends = self._points[rows].reshape(len(rows), len(self._thing), 2, 3)
         point, way = ends[:, :, 0], ends[:, :, 0] - ends[:, :, 1]
         distance = np.sqrt(np.einsum("kri,kri->kr", way, way))
-        found = distance > 0
+        found = ends.any(axis=(2, 3))
         # Where they overlap, the two points have changed sides.
         outward = self._centres[worlds, self._geom] - point
         sign = np.where(np.einsum("kri,kri->kr", outward, way) < 0, -1.0, 1.0)
-        normal = way * (sign / np.where(found, distance, 1.0))[..., None]
+        normal = way * (sign / np.where(distance > 0, distance, 1.0))[..., None]
         distance *= sign
         anchor, axis = self._anchors[worlds, self._joints], self._axes[worlds, self._joints]
         jacobian = distance_jacobian(point, normal, anchor, axis, self._slides) * self._moves
