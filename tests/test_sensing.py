@@ -156,6 +156,16 @@ def test_nothing_is_measured_unless_asked_for(make_env):
         ArmEnv(costs={"mine": lambda state: state.trace["ee_speed"]})
 
 
+class Asking:
+    """A cost of 0 that asks for measurements."""
+
+    def __init__(self, sensing):
+        self.sensing = sensing
+
+    def __call__(self, state):
+        return np.zeros(len(state.time))
+
+
 @pytest.mark.parametrize(
     ("sensing", "measured"),
     [
@@ -170,13 +180,7 @@ def test_nothing_is_measured_unless_asked_for(make_env):
 )
 def test_what_a_cost_gets_for_what_it_asks(make_env, sensing, measured):
     """As docs/howto/cost.md lists it, and as the error says where a cost has not asked."""
-
-    class Mine:
-        def __call__(self, state):
-            return np.zeros(len(state.time))
-
-    Mine.sensing = sensing
-    env = make_env(ArmEnv, costs={"mine": Mine()}, seed=0)
+    env = make_env(ArmEnv, costs={"mine": Asking(sensing)}, seed=0)
     env.reset()
     assert set(env.arm_state.trace) == measured
     (asked,) = (f"{name}={value}" for name, value in asdict(sensing).items() if value)
@@ -189,12 +193,7 @@ def test_what_is_measured_alone_is_measured_alike(make_env):
     """Of the same substeps, whatever else is measured."""
 
     def traces(sensing):
-        class Mine:
-            def __call__(self, state):
-                return np.zeros(len(state.time))
-
-        Mine.sensing = sensing
-        env = make_env(ArmEnv, costs={"mine": Mine()}, seed=0)
+        env = make_env(ArmEnv, costs={"mine": Asking(sensing)}, seed=0)
         env.reset()
         step(env, [1.0, 0.5, -0.5])
         return env.arm_state.trace

@@ -83,12 +83,12 @@ class ArmGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observation(self.arm_env.reset()), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        batch = torch.tensor(np.asarray(action, dtype=np.float32))
-        if batch.shape != self.action_space.shape:
+        array = np.asarray(action, dtype=np.float32)
+        if array.shape != self.action_space.shape:
             raise ValueError(
-                f"action must have shape {self.action_space.shape}, got {tuple(batch.shape)}."
+                f"action must have shape {self.action_space.shape}, got {array.shape}."
             )
-        batch = batch[None]
+        batch = torch.tensor(array)[None]
         after = self.arm_env.step(TensorDict({"action": batch}, batch_size=[1]))["next"]
         costs = after["cost"][0].tolist()
         info = {

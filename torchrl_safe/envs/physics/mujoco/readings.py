@@ -168,7 +168,7 @@ def nearest(closest: Array, motions: Array, ways: Ways) -> dict[str, Array]:
     apart = np.where(closest.any(axis=(-2, -1)), apart, np.inf)
     rows, shape = np.arange(len(apart)), apart.argmin(axis=1)
     clearance = apart[rows, shape]
-    # Of a mere touch it is unknown, and all approaches are 0.
+    # Where surfaces just touch, nobody knows the normal, and approaches are 0.
     normal = way[rows, shape] / np.where(clearance == 0, 1.0, clearance)[:, None]
     on_arm, on_obstacle = np.moveaxis(closest[rows, shape], 1, 0)
     centre, moving, turning = np.moveaxis(motions[rows, shape], 1, 0)
