@@ -206,6 +206,8 @@ def test_summary_of_hand_made_episodes():
     }  # fmt: skip
     for estimate, low, high in summary.values():
         assert low < estimate < high
+    with pytest.raises(ValueError, match=r"success must be True or False, got torch\.float32"):
+        summarize(episodes.set("success", costs[:, :1]))
 
 
 def test_figures_of_a_batch():

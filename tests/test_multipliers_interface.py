@@ -57,6 +57,15 @@ def test_limits_are_where_the_loss_is():
     assert updater.cost_limit.dtype == torch.float64
 
 
+def test_limits_are_set_all_at_once():
+    """What is read is a copy, whatever the loss's type, so no limit is set unchecked."""
+    updater = DualAscent(make_module(1.0, 1.0), cost_limit=[2.0, 3.0], lr=0.1)
+    updater.cost_limit[0] = NAN
+    assert updater.cost_limit.tolist() == [2, 3]
+    updater.cost_limit = [50.0, 3.0]
+    assert updater.cost_limit.tolist() == [50, 3]
+
+
 def test_no_finished_episode_changes_nothing(adam):
     before = snapshot(adam)
     adam.step(torch.zeros(0, 2))

@@ -143,9 +143,18 @@ class LearnsOne(PPOLagrangianLoss):
         return super().forward(data.replace({"cost_value_target": target}))
 
 
+class LearnsTheNext(PPOLagrangianLoss):
+    """The critic's value of each cost learns the targets of another."""
+
+    def forward(self, data):
+        target = data["cost_value_target"].roll(1, -1)
+        return super().forward(data.replace({"cost_value_target": target}))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (LearnsTheNext, "the critic's value of cost 0 learns other targets"),
         (FirstOnly, "cost 1 of 3 does not act on the policy as it does alone"),
         (LearnsOne, "the target of cost 1 has no effect"),
     ],
@@ -275,8 +284,22 @@ class Changes(PPOLagrangianLoss):
         return super().forward(data)
 
 
+class Moves(PPOLagrangianLoss):
+    """Its own multiplier."""
+
+    def forward(self, data):
+        losses = super().forward(data)
+        self.lagrange_multiplier.mul_(0.9)
+        return losses
+
+
 @pytest.mark.parametrize(
-    ("make", "message"), [(Writes, r"written \{'left'\}"), (Changes, "entry 'advantage' of the")]
+    ("make", "message"),
+    [
+        (Writes, r"written \{'left'\}"),
+        (Changes, "entry 'advantage' of the"),
+        (Moves, "a call changed lagrange_multiplier"),
+    ],
 )
 def test_an_input_that_is_written_into(make, message):
     with pytest.raises(AssertionError, match=message):

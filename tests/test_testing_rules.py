@@ -30,6 +30,13 @@ class Together(Rule):
         return multiplier + 0.1 * violation * torch.tensor(1.0 + 0.1 * (len(violation) - 1))
 
 
+class Leaks(Rule):
+    """The first cost moves the multiplier of the second too."""
+
+    def next_multiplier(self, multiplier, violation):
+        return multiplier + 0.1 * violation.cumsum(0)
+
+
 class Unbounded(Rule):
     def _move(self, buffer, episode_cost):
         buffer.add_(0.1 * self._violation(episode_cost))
@@ -70,7 +77,8 @@ class Amnesiac(Rule):
     ("rule", "message"),
     [
         (Backwards, r"cost 3 under a limit of 1 moved 1\.0 to 0\.8"),
-        (Together, "a cost moves its multiplier as it does alone"),
+        (Together, "cost 0 moves its multiplier as it does alone"),
+        (Leaks, "cost 1 moves its multiplier as it does alone"),
         (Unbounded, "multipliers must be finite and not negative"),
         (NewTensor, "moved|in place"),
         (Trusting, r"a cost of NaN, .* must raise a ValueError"),

@@ -130,8 +130,8 @@ def summarize(
         Estimate, lower and upper end, by name of the figure.
 
     Raises:
-        ValueError: if there is not a different name for each cost, or fewer than two episodes,
-            which have no interval.
+        ValueError: if there is not a different name for each cost, ``success`` is not bool, or
+            there are fewer than two episodes, which have no interval.
 
     Examples:
         >>> episodes = TensorDict(
@@ -147,6 +147,8 @@ def summarize(
     costs = episodes["episode_cost"]
     names = check_names(cost_names, costs.shape[-1])
     success = episodes.get("success", None)
+    if success is not None and success.dtype != torch.bool:
+        raise ValueError(f"success must be True or False, got {success.dtype}.")
     estimates = {} if success is None else {"success": share(success)}
     estimates["return"] = mean(episodes["episode_reward"])
     estimates["steps"] = mean(episodes["steps"])

@@ -166,7 +166,8 @@ def check_num_costs(
     """Checks that each of k costs of an on-policy loss acts through its own column.
 
     With one cost under constraint and the others not, the gradient of the policy must be that of
-    a loss that knows this cost alone; and the targets of every cost must count for its critic.
+    a loss that knows this cost alone; and each value of the critic must learn the targets of its
+    own cost: where they are what it predicts, any others give a larger loss.
 
     Args:
         make_loss (callable): see :func:`check_equals_at_zero`.
@@ -186,6 +187,10 @@ def check_num_costs(
         >>> check_num_costs(PPOLagrangianLoss)
     """
     data = make_data(num_costs)
+    exact = data.clone()
+    with torch.no_grad():
+        cost_critic = make_networks(num_costs, seed=0, keys={})[2]
+        exact["cost_value_target"] = cost_critic(data.clone())["cost_value"]
     for index in range(num_costs):
         alone = data.clone()
         for key in list(alone.keys(True, True)):
@@ -207,6 +212,14 @@ def check_num_costs(
             bool(after != before),
             f"{named(loss)}: the target of cost {index} has no effect on any loss",
         )
+        for step in (-0.01, 0.01):
+            moved = exact.clone()
+            moved["cost_value_target"][..., index] += step
+            before, after = (total(call(loss, each)) for each in (exact, moved))
+            require(
+                bool(after > before),
+                f"{named(loss)}: the critic's value of cost {index} learns other targets",
+            )
 
 
 def check_multiplier_direction(

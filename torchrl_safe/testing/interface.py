@@ -192,6 +192,8 @@ def check_input_unchanged(
 ) -> None:
     """Checks that a loss writes nothing into the data that it is called with.
 
+    Nor may it move its own multipliers: only a rule does.
+
     Args:
         make_loss (callable): see :func:`check_equals_at_zero`.
 
@@ -204,7 +206,7 @@ def check_input_unchanged(
         constrain (callable, optional): see :func:`check_equals_at_zero`.
 
     Raises:
-        AssertionError: if an entry is new, gone or changed.
+        AssertionError: if an entry is new, gone or changed, or a multiplier is.
 
     Examples:
         >>> from torchrl_safe.objectives import PPOLagrangianLoss
@@ -213,12 +215,22 @@ def check_input_unchanged(
     loss = constrained(make_loss, make_networks, num_costs, constrain)
     data = make_data(num_costs)
     before = data.clone()
+    constraints = _constraints(loss)
     loss(data)
+    for name, buffer in _constraints(loss).items():
+        require_equal(f"{named(loss)}: a call changed {name}", buffer, constraints[name])
     data = data.exclude(*writes)
     now, old = (set(each.keys(True, True)) for each in (data, before))
     require(now == old, f"{named(loss)}: entries written {now - old} and removed {old - now}")
     for key in old:
         require_equal(f"{named(loss)}: entry {key!r} of the input changed", data[key], before[key])
+
+
+def _constraints(loss: LossModule) -> dict[str, Tensor]:
+    """Copies of what updaters write."""
+    written = ("lagrange_multiplier", "cost_violation")
+    buffers = loss.named_buffers(recurse=False)
+    return {name: buffer.clone() for name, buffer in buffers if name in written}
 
 
 def check_state_dict(

@@ -62,9 +62,14 @@ def _check_directions(make_updater: MakeUpdater, init: float) -> None:
     updater.step(torch.tensor([[2.0, 1.0], [4.0, 1.0]]))
     require(buffer[0].item() > init, f"cost 3 under a limit of 1 moved {init} to {buffer[0]}")
     require(buffer[1].item() < init, f"cost 1 under a limit of 5 moved {init} to {buffer[1]}")
-    alone = _make(make_updater, 1.0, init=init)
-    alone.step(torch.tensor([[2.0], [4.0]]))
-    require_close("a cost moves its multiplier as it does alone", buffer[:1], _multiplier(alone))
+    for index, (limit, costs) in enumerate(((1.0, (2.0, 4.0)), (5.0, (1.0, 1.0)))):
+        alone = _make(make_updater, limit, init=init)
+        alone.step(torch.tensor(costs).unsqueeze(-1))
+        require_close(
+            f"cost {index} moves its multiplier as it does alone",
+            buffer[index : index + 1],
+            _multiplier(alone),
+        )
     for cost in (0.0, 100.0, 0.0, 0.0):
         for _ in range(20):
             updater.step(torch.full((2, 2), cost))

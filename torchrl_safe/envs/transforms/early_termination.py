@@ -36,12 +36,14 @@ class EarlyTermination(CostTally):
 
     Keyword Args:
         termination_reward (float, optional): added to the reward of the step that ends the
-            episode. Defaults to ``0.0``.
+            episode, and of each that an agent takes after its own end. Defaults to ``0.0``.
         cost_key (NestedKey, optional): the costs, among the rewards, shape ``(*batch, k)``.
             Defaults to ``"cost"``.
         reward_key (NestedKey, optional): the reward. Defaults to ``"reward"``.
         out_key (NestedKey, optional): the sums so far, shape ``(*batch, k)``.
-            Defaults to ``"accumulated_cost"``.
+            Defaults to ``"accumulated_cost"``. The next step starts from them, so a transform
+            outside of a :class:`~torchrl.envs.ParallelEnv` must write its own key; only inside an
+            error says so.
         terminated_key (NestedKey, optional): Defaults to ``"terminated"``.
         done_key (NestedKey, optional): Defaults to ``"done"``.
 

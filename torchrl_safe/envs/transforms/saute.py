@@ -47,7 +47,9 @@ class Saute(CostTally):
             Defaults to ``"cost"``.
         reward_key (NestedKey, optional): the reward that is replaced. Defaults to ``"reward"``.
         out_key (NestedKey, optional): the safety state, shape ``(*batch, k)``.
-            Defaults to ``"remaining_budget"``.
+            Defaults to ``"remaining_budget"``. The next step starts from it, so a transform outside
+            of a :class:`~torchrl.envs.ParallelEnv` must write its own key; only inside an error
+            says so.
 
     Raises:
         ValueError: if ``budget``, ``unsafe_reward`` or ``discount`` is not usable, or a later

@@ -62,8 +62,11 @@ class CostUpdater(abc.ABC):
 
     @property
     def cost_limit(self) -> Tensor:
-        """The limits, shape ``(k,)``, where the loss is. You can set what the constructor takes."""
-        return self._cost_limit.to(getattr(self.loss_module, self.buffer_name))
+        """A copy of the limits, shape ``(k,)``, where the loss is.
+
+        You can set what the constructor takes, all limits at once.
+        """
+        return self._cost_limit.to(getattr(self.loss_module, self.buffer_name), copy=True)
 
     @cost_limit.setter
     def cost_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> None:
@@ -156,7 +159,7 @@ class CostUpdater(abc.ABC):
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the updater; the buffer is in the state of the loss."""
         return {
-            "cost_limit": self.cost_limit.clone(),
+            "cost_limit": self.cost_limit,
             "pessimism": self.pessimism,
             "cost_names": list(self.cost_names) if self._has_names else None,
         }
