@@ -41,9 +41,9 @@ class EarlyTermination(CostTally):
             Defaults to ``"cost"``.
         reward_key (NestedKey, optional): the reward. Defaults to ``"reward"``.
         out_key (NestedKey, optional): the sums so far, shape ``(*batch, k)``.
-            Defaults to ``"accumulated_cost"``. The next step starts from them, so a transform
-            outside of a :class:`~torchrl.envs.ParallelEnv` must write its own key; only inside an
-            error says so.
+            Defaults to ``"accumulated_cost"``. The next step reads them, so no later transform may
+            change them. One that does raises an error, but for those outside a
+            :class:`~torchrl.envs.ParallelEnv`, which this transform cannot see.
         terminated_key (NestedKey, optional): Defaults to ``"terminated"``.
         done_key (NestedKey, optional): Defaults to ``"done"``.
 

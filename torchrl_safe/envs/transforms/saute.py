@@ -47,9 +47,9 @@ class Saute(CostTally):
             Defaults to ``"cost"``.
         reward_key (NestedKey, optional): the reward that is replaced. Defaults to ``"reward"``.
         out_key (NestedKey, optional): the safety state, shape ``(*batch, k)``.
-            Defaults to ``"remaining_budget"``. The next step starts from it, so a transform outside
-            of a :class:`~torchrl.envs.ParallelEnv` must write its own key; only inside an error
-            says so.
+            Defaults to ``"remaining_budget"``. The next step reads it, so no later transform may
+            change it. One that does raises an error, but for those outside a
+            :class:`~torchrl.envs.ParallelEnv`, which this transform cannot see.
 
     Raises:
         ValueError: if ``budget``, ``unsafe_reward`` or ``discount`` is not usable, or a later
