@@ -3,7 +3,7 @@ import pytest
 import torch
 from bullet_worlds import worlds_of
 from tensordict import TensorDict
-from worlds import Places, placements, rest, step, turn
+from worlds import Places, at_speed, placements, rest, step, turn
 
 from torchrl_safe.envs import (
     ArmEnv,
@@ -242,17 +242,14 @@ def test_motion_begins_anew_with_the_episode(make_env):
 @both_engines
 def test_what_is_gone_in_the_next_episode_is_at_rest(make_env):
     """It was on its way in the one before, and is still said to be on one."""
-
-    def path(times):
-        way = np.array([0.6, 0.2, 0.3]) + times[:, None, None] * (0, 0.2, 0)
-        return way, np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1, 1))
-
-    layout = Places(Sphere(), at=[(0.6, 0.2, 0.3)], path=path)
+    start = (0.6, 0.2, 0.3)
+    path = at_speed(start, (0, 0.2, 0))
+    layout = Places(Sphere(), at=[start], path=path)
     env = make_env(ArmEnv, obstacles=layout, seed=0)
     env.reset()
     np.testing.assert_allclose(env.arm_state.obstacle_velocity, [[[0, 0.2, 0]]], atol=1e-9)
     rest(env)
-    layout.placement = Placement([(0.6, 0.2, 0.3)], present=[False], path=path)
+    layout.placement = Placement([start], present=[False], path=path)
     env.reset()
     for _ in range(2):
         np.testing.assert_array_equal(env.arm_state.obstacle_velocity, 0)

@@ -7,7 +7,7 @@ import pybullet
 import pytest
 import torch
 from bullet_worlds import worlds_of
-from worlds import ARMS, Places, each_arm, home_of, rest, step
+from worlds import ARMS, Places, at_speed, each_arm, home_of, rest, step
 
 from torchrl_safe.envs import (
     PANDA,
@@ -272,12 +272,9 @@ def test_what_just_touches_is_at_a_distance_of_zero(make_env, turntable):
 
 def test_clearance_is_negative_where_they_overlap(make_env, turntable):
     """A ball goes 2 cm towards the end of the bar, and 2 cm into it."""
-
-    def path(times):
-        way = np.array([0.621, 0.0, 0.5]) - times[:, None, None] * (0.4, 0, 0)
-        return way, np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1, 1))
-
-    turntable["obstacles"] = Places(Sphere(0.1), at=[(0.621, 0, 0.5)], path=path)
+    start = (0.621, 0, 0.5)
+    path = at_speed(start, (-0.4, 0, 0))
+    turntable["obstacles"] = Places(Sphere(0.1), at=[start], path=path)
     env = make_env(ArmEnv, **turntable, costs={"apart": SpeedAndSeparation()})
     env.reset()
     clearances = []

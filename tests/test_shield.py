@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from states import make_state
-from worlds import ENGINES, Places, each_arm, step
+from worlds import ENGINES, Places, at_speed, each_arm, step
 
 from experiments.pilots import act, make_pilot
 from torchrl_safe.envs import (
@@ -52,6 +52,15 @@ def build(physics, arm=PANDA, free_fingers=False):
     return simulator
 
 
+def nearest_to_bar(physics, turntable, shape, centre, reach):
+    """What is near the bar of the turntable, at rest, of one obstacle."""
+    simulator = physics.build(turntable["arm"], Scene(), num_envs=1, shapes=(shape,), reach=reach)
+    simulator.reset(0, Placement([centre]), np.zeros(3), np.zeros((0, 3)))
+    near = simulator.nearest(np.arange(1), np.zeros((1, 1)), np.zeros((1, 0)))
+    simulator.close()
+    return near
+
+
 def nearest_of_each(simulator, joints, fingers):
     """Distance and Jacobian of the nearest pair of each obstacle and the table, ``(2, 3, ...)``."""
     near = simulator.nearest(np.arange(2), joints, fingers)
@@ -95,38 +104,26 @@ def test_both_engines_measure_the_same(arm):
 @pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
 def test_the_way_out_of_an_overlap(turntable, physics):
     """A ball reaches 1 cm into the side of the bar, which has to turn by 1 cm / 0.3 m out of it."""
-    arm = turntable["arm"]
-    simulator = physics.build(arm, Scene(), num_envs=1, shapes=(Sphere(0.1),), reach=0.3)
-    placement = Placement([[0.3, 0.14, 0.5]])
-    simulator.reset(0, placement, np.zeros(3), np.zeros((0, 3)))
-    near = simulator.nearest(np.arange(1), np.zeros((1, 1)), np.zeros((1, 0)))
+    near = nearest_to_bar(physics, turntable, Sphere(0.1), (0.3, 0.14, 0.5), reach=0.3)
     pair = near.distance[0].argmin()
     assert near.distance[0, pair] == pytest.approx(-0.01, abs=1e-3)
     np.testing.assert_allclose(near.normal[0, pair], [0, -1, 0], atol=1e-3)
     assert near.jacobian[0, pair, 0] == pytest.approx(-0.3, abs=1e-3)
-    simulator.close()
 
 
 @pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
 def test_what_just_touches_is_near(turntable, physics):
     """A box of exact numbers lies on the bar."""
-    arm, box = turntable["arm"], Box((0.125,) * 3)
-    simulator = physics.build(arm, Scene(), num_envs=1, shapes=(box,), reach=0.3)
-    simulator.reset(0, Placement([[0.25, 0.0, 0.645]]), np.zeros(3), np.zeros((0, 3)))
-    near = simulator.nearest(np.arange(1), np.zeros((1, 1)), np.zeros((1, 0)))
+    near = nearest_to_bar(physics, turntable, Box((0.125,) * 3), (0.25, 0.0, 0.645), reach=0.3)
     assert near.distance.min() == pytest.approx(0, abs=5e-4)
-    simulator.close()
 
 
 @pytest.mark.parametrize("physics", ENGINES.values(), ids=ENGINES)
 def test_what_cannot_sink_is_not_measured_against_the_table(turntable, physics):
     """No joint could change it, and below the margin it would hold the arm for ever."""
-    simulator = physics.build(turntable["arm"], Scene(), num_envs=1, shapes=(Sphere(),), reach=1.0)
-    simulator.reset(0, Placement([[0.8, 0.0, 0.5]]), np.zeros(3), np.zeros((0, 3)))
-    near = simulator.nearest(np.arange(1), np.zeros((1, 1)), np.zeros((1, 0)))
+    near = nearest_to_bar(physics, turntable, Sphere(), (0.8, 0.0, 0.5), reach=1.0)
     assert np.isfinite(near.distance[:, near.other == 0]).any()
     assert not np.isfinite(near.distance[:, near.other == 1]).any()
-    simulator.close()
 
 
 def test_measuring_changes_nothing(make_env, engine):
@@ -222,12 +219,8 @@ def test_far_from_everything_a_shield_does_nothing(make_env, engine, turntable):
 
 def test_what_comes_is_given_way_to(make_env, engine, turntable):
     """A ball that comes at 0.4 m/s pushes the bar, which is to rest, away before it touches it."""
-
-    def path(times):
-        positions = np.array([[[0.45, 0.25, 0.5]]]) - 0.4 * times[:, None, None] * [0, 1, 0]
-        return positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1, 1))
-
-    layout = Places(Sphere(0.1), at=[(0.45, 0.25, 0.5)], path=path)
+    start = (0.45, 0.25, 0.5)
+    layout = Places(Sphere(0.1), at=[start], path=at_speed(start, (0, -0.4, 0)))
     for shield in (None, Shield()):
         env = make_env(ArmEnv, **{**turntable, "obstacles": layout, "shield": shield})
         env.reset()

@@ -104,6 +104,16 @@ class Places:
         return self.placement
 
 
+def at_speed(start, velocity):
+    """The path of one obstacle from a place, m, at a velocity, m/s; it does not turn."""
+
+    def path(times):
+        positions = np.array(start) + times[:, None, None] * velocity
+        return positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1, 1))
+
+    return path
+
+
 def step(env, action):
     """The results of an action, given for one world or for each."""
     action = torch.as_tensor(action, dtype=torch.float32).expand(env.action_spec.shape)

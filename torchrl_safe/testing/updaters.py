@@ -57,14 +57,15 @@ def _multiplier(updater: MultiplierUpdater) -> Tensor:
 
 
 def _check_directions(make_updater: MakeUpdater, init: float) -> None:
-    updater = _make(make_updater, 1.0, 5.0, init=init)
+    limits, costs = (1.0, 5.0), torch.tensor([[2.0, 1.0], [4.0, 1.0]])
+    updater = _make(make_updater, *limits, init=init)
     buffer, address = _multiplier(updater), _multiplier(updater).data_ptr()
-    updater.step(torch.tensor([[2.0, 1.0], [4.0, 1.0]]))
+    updater.step(costs)
     require(buffer[0].item() > init, f"cost 3 under a limit of 1 moved {init} to {buffer[0]}")
     require(buffer[1].item() < init, f"cost 1 under a limit of 5 moved {init} to {buffer[1]}")
-    for index, (limit, costs) in enumerate(((1.0, (2.0, 4.0)), (5.0, (1.0, 1.0)))):
+    for index, limit in enumerate(limits):
         alone = _make(make_updater, limit, init=init)
-        alone.step(torch.tensor(costs).unsqueeze(-1))
+        alone.step(costs[:, index : index + 1])
         require_close(
             f"cost {index} moves its multiplier as it does alone",
             buffer[index : index + 1],
