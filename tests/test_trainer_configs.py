@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from on_policy import make_loss
@@ -176,6 +177,19 @@ def test_a_collector_keeps_a_policy_of_its_own(monkeypatch, own):
     )
     given = own if "mine" in own.values() else {"policy": loss.actor_network}
     assert collector == {"frames_per_batch": 40, **given}
+
+
+def test_an_updater_without_a_rule(example):
+    """As without its line in the defaults list."""
+    text = (example / "config.yaml").read_text(encoding="utf-8")
+    path = example / "no_rule.yaml"
+    path.write_text(text.replace("  - updater@updater: pid_control\n", ""), encoding="utf-8")
+    with initialize_config_dir(str(example), version_base="1.3"):
+        config = compose("no_rule")
+    with pytest.raises(InstantiationException, match=r"updater must name .*collision"):
+        instantiate(config.trainer)
+    with pytest.raises(InstantiationException, match=r"updater must name .* None"):
+        instantiate(read(example, "trainer.updater=null").trainer)
 
 
 def test_a_nested_key_arrives_as_one(example):

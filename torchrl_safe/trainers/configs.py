@@ -199,7 +199,15 @@ def make_constrained_ppo_trainer(
         updater (callable): called with the loss.
         episode_cost_key (NestedKey or list of str): see ``ConstrainedPPOTrainer``.
         **settings: the other fields of :class:`ConstrainedPPOTrainerConfig`.
+
+    Raises:
+        TypeError: if the updater is not callable, as one without ``_target_`` is not.
     """
+    if not callable(updater):
+        raise TypeError(
+            "updater must name a rule, for example with 'updater@updater: pid_control' in the "
+            f"defaults list, got {updater!r}."
+        )
     if isinstance(collector, partial):
         own = {"policy", "policy_factory"} & {k for k, v in collector.keywords.items() if v}
         collector = collector() if own else collector(policy=loss_module.actor_network)
