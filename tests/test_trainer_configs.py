@@ -140,25 +140,15 @@ def test_another_rule_and_two_costs(example):
 
 
 def test_another_parametrization(example):
-    text = (example / "config.yaml").read_text(encoding="utf-8")
-    text = text.replace("updater: pid_control", "updater: dual_ascent")
-    (example / "dual.yaml").write_text(text, encoding="utf-8")
     softplus = "torch.distributions.transforms.SoftplusTransform"
     chosen = ["updater.lr=0.1", f"updater.parametrization._target_={softplus}"]
-    with initialize_config_dir(str(example), version_base="1.3"):
-        config = compose("dual", overrides=chosen)
+    config = read(example, "updater=dual_ascent", *chosen)
     updater = instantiate(config.updater)(instantiate(config.loss, multiplier_init=1.0))
     assert isinstance(updater.parametrization, SoftplusTransform)
 
 
 def test_a_loss_that_reads_violations(example):
-    path = example / "crpo.yaml"
-    documented = (example / "config.yaml").read_text(encoding="utf-8")
-    text = documented.replace("loss: lagrangian", "loss: crpo")
-    text = text.replace("updater: pid_control", "updater: violation")
-    path.write_text(text, encoding="utf-8")
-    with initialize_config_dir(str(example), version_base="1.3"):
-        trainer = instantiate(compose("crpo").trainer)
+    trainer = instantiate(read(example, "loss=crpo", "updater=violation").trainer)
     assert isinstance(trainer.loss_module, CRPOLoss)
     trainer._modules["multiplier"].updater.step(torch.tensor([[2.0]]))
     assert trainer.loss_module.cost_violation.tolist() == [1.5]
@@ -181,13 +171,8 @@ def test_a_collector_keeps_a_policy_of_its_own(monkeypatch, own):
 
 def test_an_updater_without_a_rule(example):
     """As without its line in the defaults list."""
-    text = (example / "config.yaml").read_text(encoding="utf-8")
-    path = example / "no_rule.yaml"
-    path.write_text(text.replace("  - updater@updater: pid_control\n", ""), encoding="utf-8")
-    with initialize_config_dir(str(example), version_base="1.3"):
-        config = compose("no_rule")
     with pytest.raises(InstantiationException, match=r"updater must name .*collision"):
-        instantiate(config.trainer)
+        instantiate(read(example, "~updater").trainer)
     with pytest.raises(InstantiationException, match=r"updater must name .* None"):
         instantiate(read(example, "trainer.updater=null").trainer)
 
