@@ -37,7 +37,7 @@ class Affine(torch.nn.Module):
 
 
 class Standardize(Affine):
-    """The same, clipped to five deviations from the mean, as is usual.
+    """An affine map of each number, clipped to [-5, 5]: to five deviations from the mean.
 
     Random actions hardly ever touch an object: they say nothing about its velocities when it is
     pushed. Without the clip, those could be a hundred deviations, and outweigh everything else that

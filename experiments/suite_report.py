@@ -101,7 +101,7 @@ def whole(runs: Sequence[Run], limits: Limits) -> str:
     """Returns a Markdown table with a row for each algorithm, over all tasks."""
     lines = [
         "| algorithm | success (IQM) | largest cost / limit (IQM) | runs above a limit "
-        "| tasks with a limit exceeded three times | cost while training / PPO's |",
+        "| tasks with a cost of three limits or more | cost while training / PPO's |",
         "|---" * 6 + "|",
     ]
     algorithms = _algorithms(runs)
@@ -110,7 +110,7 @@ def whole(runs: Sequence[Run], limits: Limits) -> str:
         middle, high = (_interval(interquartile_mean, score) for score in (success, largest))
         above = _interval(mean, (largest > 1).double())
         # The violation of a task is that of its mean over seeds.
-        thrice = sum(
+        threefold = sum(
             any(
                 _mean_of(_select(runs, task, algorithm), "evaluation", f"cost/{name}") >= 3 * limit
                 for name, limit in limits[task].items()
@@ -120,7 +120,7 @@ def whole(runs: Sequence[Run], limits: Limits) -> str:
         training = "" if "ppo" not in algorithms else f"{_relative(runs, limits, algorithm):.2f}"
         lines.append(
             f"| {algorithm} | {_shown(middle, '.1%')} | {_shown(high, '.2f')} "
-            f"| {_shown(above, '.0%')} | {thrice}/{len(_tasks(runs))} | {training} |"
+            f"| {_shown(above, '.0%')} | {threefold}/{len(_tasks(runs))} | {training} |"
         )
     lines.append(
         "\nIQM: interquartile mean over all runs. Brackets: 95 % stratified bootstrap. A run is "

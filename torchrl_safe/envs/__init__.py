@@ -1,7 +1,7 @@
 """Robot arms with costs as TorchRL environments, and transforms for any environment with costs.
 
-Only arms need a physics engine: ``physics=Bullet()`` the ``arms`` extra, ``physics=MuJoCo()`` the
-``mujoco`` extra.
+Only arms need a physics engine: ``physics=Bullet()`` the extra ``arms``, ``physics=MuJoCo()`` the
+extra ``mujoco``. The files of the arms come with ``arms`` and ``more-arms``.
 """
 
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, JointDelta

@@ -23,9 +23,9 @@ class Collision:
         c = \mathbb{1}[\min_{t, i} d_{t,i} \le \text{margin}]
 
     with d the distance (m) between the arm and obstacle i in physics substep t. A touch that begins
-    and ends between two control steps counts too. (Without a margin the engine's contacts tell.
-    They are found at the beginning of a substep, so the very last state of an episode is not
-    checked.) Kovač & Farkaš 2023 and Safety Gym (Ray et al. 2019) use this cost.
+    and ends between two control steps counts too. (Without a margin, the engine's contacts
+    decide. They are found at the beginning of a substep, so the very last state of an episode is
+    not checked.) Kovač & Farkaš 2023 and Safety Gym (Ray et al. 2019) use this cost.
 
     Args:
         margin: distance from an obstacle that counts as a touch, m. It is measured, which takes

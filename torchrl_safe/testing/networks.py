@@ -87,6 +87,8 @@ def make_networks(
 
     Args:
         num_costs (int, optional): number k of costs, the width of the cost critic.
+
+    Keyword Args:
         seed (int, optional): seed of the weights.
         keys (mapping, optional): other keys than the default, named as in the ``tensor_keys`` of a
             loss: ``value`` and ``cost_value`` are what the critics write. Names that belong to
@@ -122,7 +124,7 @@ class _QValue(nn.Module):
 def make_q_actor(*, deterministic: bool = False, action: NestedKey = "action") -> TensorDictModule:
     """Makes a policy with actions in [-1, 1]: as SAC's, or deterministic as TD3's.
 
-    Args:
+    Keyword Args:
         deterministic (bool, optional): return an :class:`~torchrl.modules.Actor` without
             randomness. Defaults to ``False``.
         action (NestedKey, optional): key of the action, of 2 numbers.
@@ -177,6 +179,8 @@ def make_q_networks(
 
     Args:
         num_costs (int, optional): number k of costs, the width of the cost critic.
+
+    Keyword Args:
         seed (int, optional): seed of the weights.
         keys (mapping, optional): other keys than the default, named as in the ``tensor_keys`` of a
             loss: ``action``, ``state_action_value`` and ``state_action_cost_value``. Names that

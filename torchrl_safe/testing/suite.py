@@ -33,7 +33,7 @@ def check_loss(
     *,
     constrain: Constrain = set_multiplier,
 ) -> None:
-    """Checks a constrained on-policy loss: every check of this module that fits it.
+    """Checks a constrained on-policy loss: every check of this package that fits it.
 
     Args:
         make_loss (callable): makes the loss, called as ``make_loss(actor, critic, cost_critic,
@@ -79,7 +79,7 @@ def check_q_loss(
     deterministic: bool = False,
     constrain: Constrain = set_multiplier,
 ) -> None:
-    """Checks a constrained off-policy loss: every check of this module that fits it.
+    """Checks a constrained off-policy loss: every check of this package that fits it.
 
     Args:
         make_loss (callable): makes the loss, called as ``make_loss(actor, qvalue, cost_qvalue,

@@ -270,8 +270,9 @@ class SafeGymWrapper(_CostBesideReward):
     Vectorized environments may use the autoreset modes that TorchRL supports, ``DISABLED`` and
     ``SAME_STEP``. In both, and in the vectorized environments of Gymnasium 0.28 and
     Safety-Gymnasium, which have no modes, you get the true last observation, reward and cost of an
-    episode. There, make each cost a float: Gymnasium gives an entry of a vectorized info the type
-    that it has in the first environment, and fractions are lost if that is an integer.
+    episode. In a vectorized environment, make each cost a float: Gymnasium gives an entry of a
+    vectorized info the type that it has in the first environment, and fractions are lost if that is
+    an integer.
 
     Args:
         env (gymnasium.Env or gymnasium.vector.VectorEnv): the environment.

@@ -42,8 +42,8 @@ class EarlyTermination(CostTally):
         reward_key (NestedKey, optional): the reward. Defaults to ``"reward"``.
         out_key (NestedKey, optional): the sums so far, shape ``(*batch, k)``.
             Defaults to ``"accumulated_cost"``. The next step reads them, so no later transform may
-            change them. One that does raises an error, but for those outside a
-            :class:`~torchrl.envs.ParallelEnv`, which this transform cannot see.
+            change them. One that does raises an error, unless it is outside a
+            :class:`~torchrl.envs.ParallelEnv`, where this transform cannot see it.
         terminated_key (NestedKey, optional): Defaults to ``"terminated"``.
         done_key (NestedKey, optional): Defaults to ``"done"``.
 

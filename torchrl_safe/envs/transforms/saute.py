@@ -48,8 +48,8 @@ class Saute(CostTally):
         reward_key (NestedKey, optional): the reward that is replaced. Defaults to ``"reward"``.
         out_key (NestedKey, optional): the safety state, shape ``(*batch, k)``.
             Defaults to ``"remaining_budget"``. The next step reads it, so no later transform may
-            change it. One that does raises an error, but for those outside a
-            :class:`~torchrl.envs.ParallelEnv`, which this transform cannot see.
+            change it. One that does raises an error, unless it is outside a
+            :class:`~torchrl.envs.ParallelEnv`, where this transform cannot see it.
 
     Raises:
         ValueError: if ``budget``, ``unsafe_reward`` or ``discount`` is not usable, or a later

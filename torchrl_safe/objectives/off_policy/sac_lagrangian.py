@@ -84,8 +84,8 @@ class SACLagrangianLoss(ConstrainedQLoss, SACLoss):
     and ``state_action_cost_value``. The priority is the reward's temporal difference alone.
 
     Outputs beside those of ``SACLoss``: ``loss_cost_qvalue`` and ``lagrange_multiplier_0`` ...
-    ``lagrange_multiplier_{k-1}``, these left out or kept as non-tensors with
-    ``reduction="none"`` like ``alpha`` is. The targets' discount of the costs is set with
+    ``lagrange_multiplier_{k-1}``. With ``reduction="none"`` the multipliers are left out, or kept
+    as non-tensors, as ``alpha`` is. The targets' discount of the costs is set with
     ``loss.make_cost_value_estimator(gamma=0.99)``.
 
     Examples:

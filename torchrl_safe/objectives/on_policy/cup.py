@@ -60,6 +60,7 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
+        TypeError: if an argument is unknown.
         ValueError: if ``num_costs`` or ``multiplier_init`` is not usable, or the discount of the
             costs is 1; in a call, if the cost critic or the costs have another width than
             ``num_costs``.

@@ -63,6 +63,7 @@ class FOCOPSLoss(ConstrainedPPO, PPOLoss):
         **kwargs: every keyword argument of :class:`~torchrl.objectives.PPOLoss`.
 
     Raises:
+        TypeError: if an argument is unknown.
         ValueError: if ``num_costs``, ``temperature``, ``kl_bound`` or ``multiplier_init`` is not
             usable; in a call, if the cost critic or the costs have another width than
             ``num_costs``.

@@ -91,6 +91,7 @@ class IPOLoss(CostSurrogate, ClipPPOLoss):
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
+        TypeError: if an argument is unknown.
         ValueError: if ``num_costs`` or ``sharpness`` is not positive, ``reduction`` is not
             ``"mean"`` or the discount of the costs is 1 without an ``episode_length``; in a
             call, if the cost critic or the costs have another width than ``num_costs``.

@@ -55,6 +55,7 @@ class P3OLoss(CostSurrogate, ClipPPOLoss):
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
+        TypeError: if an argument is unknown.
         ValueError: if ``num_costs`` or ``penalty_coeff`` is not positive, ``reduction`` is not
             ``"mean"`` or the discount of the costs is 1 without an ``episode_length``; in a
             call, if the cost critic or the costs have another width than ``num_costs``.

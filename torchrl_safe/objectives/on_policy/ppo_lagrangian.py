@@ -48,6 +48,7 @@ class PPOLagrangianLoss(ConstrainedPPO, ClipPPOLoss):
         **kwargs: every keyword argument of :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
+        TypeError: if an argument is unknown.
         ValueError: if ``num_costs`` or ``multiplier_init`` is not usable; in a call, if the cost
             critic or the costs have another width than ``num_costs``.
 

@@ -143,7 +143,7 @@ class WrappedLoss(LossModule):
     def set_keys(self, **kwargs: Any) -> None:
         """Sets keys of the costs here, and all others in the wrapped loss.
 
-        Do not set them in the wrapped loss itself: the costs would go by the old ones.
+        Call this, not ``set_keys`` of the wrapped loss: the cost critic would keep the old keys.
         """
         self.loss_module.set_keys(**{k: v for k, v in kwargs.items() if k not in _COST_KEYS})
         for name in _COST_KEYS & kwargs.keys():

@@ -108,8 +108,8 @@ class CostUpdater(abc.ABC):
 
         With :class:`~torchrl.envs.RewardSum` a collector's batch gives it as
         ``batch["next", "episode_cost"][batch["next", "done"].squeeze(-1)]``. Leave the collector's
-        ``set_truncated`` off: it would count parts of episodes. So would a batch of one environment
-        without that mask, which has the same shape.
+        ``set_truncated`` off: parts of episodes would count as whole ones. Do not leave the mask
+        out: with one environment the shape is right too, and each step would count as an episode.
         """
         buffer = getattr(self.loss_module, self.buffer_name)
         if not isinstance(episode_cost, Tensor):

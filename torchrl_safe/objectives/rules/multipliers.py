@@ -43,12 +43,11 @@ class MultiplierUpdater(CostUpdater):
             added to it. Without it a limit that binds is met on average only: policies end above
             it as often as below. The margin grows if episodes are few or uneven; a batch of one
             episode has no standard error and adds none. Defaults to ``0.0``.
-        normalize (bool, optional): make the violation relative, with no unit and never more than 1:
-            divide it by the standard deviation of the episode costs, or by a fifth of the limit if
-            that is larger, and clip it to [-1, 1]. The divisor is that of the batch, or of past
-            batches if that is larger; each batch moves the past a fifth of the way to its own.
-            Costs and limit times 1,000 then give the same multipliers. Needs limits that are not
-            negative. Defaults to ``False``.
+        normalize (bool, optional): make the violation relative, with no unit: divide it by a scale
+            and clip it to [-1, 1]. The scale is the standard deviation of the episode costs, and
+            at least a fifth of the limit. It rises at once, and falls by a fifth of the difference
+            in each batch. Costs and limit times 1,000 then give the same multipliers. Needs limits
+            that are not negative. Defaults to ``False``.
         cost_names (sequence of str, optional): names of the k costs in their order, for example
             ``env.cost_names``: those of limits by name, and those that errors and logs use.
             Defaults to ``("0", "1", ...)``.

@@ -68,8 +68,8 @@ class PIDControl(MultiplierUpdater):
         ki (float, optional): integral gain, for each batch. Defaults to ``0.1``.
         kd (float, optional): derivative gain, for what the violation rose since the last batch.
             Defaults to ``0.0``.
-        smoothing (float, optional): weight of the past in the moving average of the cost, from 0
-            up to but without 1. It starts at the first batch (algorithm 2 starts at 0, so that
+        smoothing (float, optional): weight of the past in the moving average of the cost, at
+            least 0 and less than 1. It starts at the first batch (algorithm 2 starts at 0, so that
             the first batch counts as a rise). Defaults to ``0.0``, the cost itself, as there.
         max_multiplier (float, optional): see :class:`MultiplierUpdater`. Defaults to ``20.0``,
             where the reward has a twentieth of the weight.

@@ -58,6 +58,7 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
             ``entropy_bonus`` is on by default; the step then maximizes it too.
 
     Raises:
+        TypeError: if an argument is unknown.
         ValueError: if ``num_costs`` or ``multiplier_init`` is not usable; in a call, if the cost
             critic or the costs have another width than ``num_costs``.
 

@@ -86,9 +86,9 @@ class TrustRegionStep:
     Args:
         loss_module (PPOLoss): :class:`~torchrl.objectives.PPOLoss` for TRPO alone, else a
             :class:`~torchrl_safe.objectives.TrustRegionLoss`. The actor must not share parameters
-            with a critic: the step would move these too. Of the losses, ``"loss_objective"`` and,
-            if there is one, ``"loss_entropy"`` are the surrogate. (An entropy estimated from
-            samples makes the line search noisy: better ``entropy_bonus=False``.)
+            with a critic: the step would move these too. The surrogate is the sum of its
+            outputs ``"loss_objective"`` and, with an entropy bonus, ``"loss_entropy"``. (An entropy
+            estimated from samples makes the line search noisy: better ``entropy_bonus=False``.)
         method (TrustRegionMethod, optional): :class:`~torchrl_safe.objectives.CPO`,
             :class:`~torchrl_safe.objectives.PCPO`, or by default
             :class:`~torchrl_safe.objectives.TRPO`, which with multipliers is TRPO-Lagrangian.
