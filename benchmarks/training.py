@@ -24,7 +24,8 @@ from benchmarks.timing import Contender, quartiles, race, ratio, timed
 from experiments.algorithms import ALGORITHMS
 from experiments.compiling import PAYS_FROM
 from experiments.config import AlgorithmName, Config
-from experiments.train import PHYSICS, collecting, make_env
+from experiments.environment import PHYSICS, make_env
+from experiments.train import collecting
 from torchrl_safe.envs import PAPER_JOINT, PAPER_SETTINGS, JointDelta
 from torchrl_safe.envs.gym import ArmGymEnv
 

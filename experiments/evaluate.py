@@ -23,9 +23,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from experiments import train
 from experiments.agent import num_costs
 from experiments.config import Config as TrainConfig, Engine
+from experiments.environment import make_env
 from experiments.files import write_whole
 from experiments.film import base_env, save_film
 from experiments.report import figures_table
@@ -112,7 +112,7 @@ def factory(config: Config, saved: Policy) -> Callable[..., EnvBase]:
                 f"gui needs physics=bullet, got {trained.physics!r}, which has no window here: "
                 "make a video instead."
             )
-        return partial(train.make_env, trained, algorithm=saved.settings["name"])
+        return partial(make_env, trained, algorithm=saved.settings["name"])
     module, _, function = config.env.partition(":")
     if not function:
         raise ValueError(f"env must be module:function, got {config.env!r}.")

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from experiments.config import Engine
+from experiments.environment import PHYSICS
 from experiments.film import project
 from experiments.style import INK, figure_style
-from experiments.train import PHYSICS
 from torchrl_safe.envs import ArmEnv, ArmState, Camera, Human, Moving
 from torchrl_safe.envs.gym import combination
 

@@ -22,6 +22,7 @@ from experiments.config import (
     SuiteTaskName,
     suite_config,
 )
+from experiments.environment import PHYSICS
 from experiments.gallery import WITH_PERSON
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.suite_report import draw
@@ -97,7 +98,7 @@ def draw_scenes(config: Config) -> None:
     pictures = config.out / "pictures"
     pictures.mkdir(parents=True, exist_ok=True)
     for name in config.tasks:
-        physics = train.PHYSICS[config.physics]
+        physics = PHYSICS[config.physics]
         env = SUITE[name].make_env(physics=physics, seed=1)
         env.rollout(10, lambda td: td.set("action", env.action_spec.zero()))  # noqa: B023
         plt.imsave(pictures / f"{name}.png", env.render(480, 360, WITH_PERSON)[0].numpy())

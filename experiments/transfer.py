@@ -20,8 +20,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
-from experiments import train
 from experiments.algorithms import ALGORITHMS, no_transforms
+from experiments.environment import PHYSICS
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import shown_cost
 from experiments.suite_report import excess
@@ -221,7 +221,7 @@ def make_env(
             task = scale_object_mass(task, 1 - _CHANGE)
         case "noise":
             settings["observation"] = Noisy(FullObservation(), 0.01, seed=seed)
-    env = task.make_env(physics=train.PHYSICS[physics], **settings)
+    env = task.make_env(physics=PHYSICS[physics], **settings)
     return TransformedEnv(env, Delay()) if condition == "delay" else env
 
 

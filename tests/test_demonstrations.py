@@ -16,8 +16,9 @@ from experiments.demonstrations import (
     standardize,
     start_from_demonstrations,
 )
+from experiments.environment import make_env
 from experiments.learners import OnPolicyLearner
-from experiments.train import SHARING, demonstrate, make_env, train, train_and_evaluate
+from experiments.train import SHARING, demonstrate, train, train_and_evaluate
 
 pytestmark = pytest.mark.integration
 

@@ -22,7 +22,8 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from experiments.algorithms import ALGORITHMS
 from experiments.config import Config
-from experiments.train import make_env, train
+from experiments.environment import make_env
+from experiments.train import train
 from torchrl_safe import envs
 from torchrl_safe.envs import ArmEnv, Collision, FullObservation, InFront, Placement, Reach, Shield
 from torchrl_safe.objectives import DualAscent, PIDControl, PPOLagrangianLoss

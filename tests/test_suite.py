@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from worlds import ARMS, placements
 
 from experiments.config import CostName, SuiteTaskName
-from experiments.train import COSTS
+from experiments.environment import COSTS
 from torchrl_safe.envs import (
     PANDA,
     SUITE,

@@ -10,7 +10,9 @@ import pytest
 from PIL import Image
 
 from experiments import evaluate, suite, suite_merge, train
+from experiments.algorithms import ALGORITHMS
 from experiments.config import Config, command_line, suite_config
+from experiments.environment import make_env
 from experiments.grid import missing
 from experiments.log import score
 from experiments.report import figures_table
@@ -79,7 +81,7 @@ def test_its_policy_is_evaluated_in_its_task(trained, capsys):
 def test_costs_are_chosen_each_with_a_limit():
     config = Config(costs={"speed": 2.0, "collision": 0.5})
     assert config.cost_limits == {"speed": 2.0, "collision": 0.5}
-    env = train.make_env(config, num_envs=1)
+    env = make_env(config, num_envs=1)
     assert env.base_env.cost_names == ("speed", "collision")
     env.close()
     assert Config(cost_limit=3.0).cost_limits == {"collision": 3.0}
@@ -87,9 +89,9 @@ def test_costs_are_chosen_each_with_a_limit():
 
 def test_every_limit_reaches_the_updater():
     config = suite_config("iiwa-reach-joints", physics="mujoco", limit_share=1.0)
-    env = train.make_env(config, num_envs=2, seed=0)
+    env = make_env(config, num_envs=2, seed=0)
     for algorithm in ("ppo-lagrangian", "trpo-lagrangian", "p3o"):
-        updater = train.ALGORITHMS[algorithm].build(env, config).updater
+        updater = ALGORITHMS[algorithm].build(env, config).updater
         limits = dict(zip(updater.cost_names, updater.cost_limit.tolist(), strict=True))
         assert limits == pytest.approx(SUITE["iiwa-reach-joints"].cost_limits)
     env.close()
@@ -98,9 +100,9 @@ def test_every_limit_reaches_the_updater():
 def test_a_share_of_each_limit_is_what_training_aims_at():
     """Updaters and budgets have the share, reports the limit."""
     config = suite_config("iiwa-reach-joints", physics="mujoco", limit_share=0.5)
-    env = train.make_env(config, 2, 0, "ppo-saute", training=True)
+    env = make_env(config, 2, 0, "ppo-saute", training=True)
     (transform,) = (each for each in env.transform if hasattr(each, "budget"))
-    updater = train.ALGORITHMS["ppo-lagrangian"].build(env, config).updater
+    updater = ALGORITHMS["ppo-lagrangian"].build(env, config).updater
     assert updater.cost_limit.tolist() == transform.budget.tolist() == [0.125, 0.25, 0.25]
     assert config.cost_limits == {"collision": 0.25, "joint-limit": 0.5, "speed": 0.5}
     env.close()
@@ -120,7 +122,7 @@ def test_a_saved_policy_is_evaluated_with_the_budget_of_its_training():
 @pytest.mark.parametrize("algorithm", ["ppo-saute", "ppo-early-termination"])
 def test_every_limit_is_a_budget(algorithm):
     config = suite_config(NAME, physics="mujoco", limit_share=1.0)
-    env = train.make_env(config, num_envs=1, algorithm=algorithm, training=True)
+    env = make_env(config, num_envs=1, algorithm=algorithm, training=True)
     (transform,) = (each for each in env.transform if hasattr(each, "budget"))
     assert transform.budget.tolist() == [*SUITE[NAME].cost_limits.values()]
     env.close()

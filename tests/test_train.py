@@ -18,11 +18,12 @@ import experiments.train
 from experiments.agent import make_agent
 from experiments.algorithms import ALGORITHMS, MULTIPLIER_RULES, OffPolicy, configured
 from experiments.config import OFF_POLICY, AlgorithmName, Config, command_line
+from experiments.environment import make_env
 from experiments.film import save_film
 from experiments.learners import NoiseSchedule
 from experiments.log import summed_costs
 from experiments.report import LEARNING, Line, plot_curves, plot_learning, table
-from experiments.train import collecting, main, make_env, start, train
+from experiments.train import collecting, main, start, train
 from torchrl_safe.envs import PickAndPlace, Push, Reach
 from torchrl_safe.policy import load_policy
 
