@@ -9,11 +9,12 @@ import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from experiments.files import write_whole
+from experiments.log import versions
+from experiments.tables import markdown
 
 _PACKAGES = (
     "torch", "torchrl", "tensordict", "pybullet", "mujoco", "gymnasium", "numpy", "panda-gym",
@@ -86,29 +87,27 @@ def record(part: str, figures: Sequence[Figure], out: Path) -> None:
 
 def machine() -> dict[str, Any]:
     """Date, versions and processor."""
-    versions = {}
-    for name in _PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "none"
     return {
         "date": datetime.now(timezone.utc).isoformat(timespec="minutes"),
         "python": platform.python_version(),
         "cpu": f"{_processor()}, {os.cpu_count()} cores",
-        "versions": versions,
+        "versions": versions(_PACKAGES),
     }
 
 
 def table(figures: Sequence[Figure]) -> str:
     """A Markdown table of figures."""
     rows = [
-        f"| {figure.name} | {figure.median:.3g} {figure.unit} | "
-        f"{figure.low:.3g} to {figure.high:.3g} | {figure.bar} | {figure.verdict} |"
+        (
+            figure.name,
+            f"{figure.median:.3g} {figure.unit}",
+            f"{figure.low:.3g} to {figure.high:.3g}",
+            figure.bar,
+            figure.verdict,
+        )
         for figure in figures
     ]
-    header = ["| | median | quartiles | target | |", "|---|---|---|---|---|"]
-    return "\n".join([*header, *rows])
+    return markdown(("", "median", "quartiles", "target", ""), rows)
 
 
 def _section(part: str, results: dict[str, Any]) -> str:

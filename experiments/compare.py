@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from itertools import product
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -20,8 +21,9 @@ from experiments import train
 from experiments.algorithms import ALGORITHMS, configured
 from experiments.config import SHIELDED, Action, AlgorithmName, Config as TrainConfig, Engine
 from experiments.grid import check_grid, run_grid, save_results
-from experiments.report import episode_costs, mean_over_seeds, seeds_within, successes
+from experiments.report import episode_costs, mean_over_seeds, seeds_within
 from experiments.style import LIGHT, colour, cost_axis, figure_style, label, limit_line
+from experiments.tables import each, markdown
 from torchrl_safe._cores import cores
 from torchrl_safe.metrics import worst_seed
 
@@ -85,24 +87,28 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
 
 def table(runs: list[dict[str, Any]]) -> str:
     """Returns a Markdown table with a row for each algorithm."""
-    lines = [
-        "| algorithm | limit | cost (95 % over seeds) | worst seed | seeds within the limit "
-        "| success | lowest | return | minutes of training |",
-        "|---" * 9 + "|",
-    ]
+    heads = (
+        "algorithm", "limit", "cost (95 % over seeds)", "worst seed", "seeds within the limit",
+        "success", "lowest", "return", "minutes of training",
+    )  # fmt: skip
+    rows = []
     for algorithm in dict.fromkeys(run["algorithm"] for run in runs):
         mine = [run for run in runs if run["algorithm"] == algorithm]
-        costs, success, limit = episode_costs(mine), successes(mine), mine[0]["cost_limit"]
-        returns = [run["evaluation"]["return"][0] for run in mine]
-        lines.append(
-            f"| {algorithm} | {limit:g} | {mean_over_seeds(costs)} "
-            f"| {worst_seed(costs.unsqueeze(-1)).value.item():.2f} "
-            f"| {seeds_within(costs, limit)} "
-            f"| {sum(success) / len(mine):.1%} | {min(success):.1%} "
-            f"| {sum(returns) / len(mine):.2f} "
-            f"| {sum(run['seconds'] for run in mine) / len(mine) / 60:.1f} |"
+        costs, success, limit = episode_costs(mine), each(mine, "success"), mine[0]["cost_limit"]
+        rows.append(
+            (
+                algorithm,
+                f"{limit:g}",
+                mean_over_seeds(costs),
+                f"{worst_seed(costs.unsqueeze(-1)).value.item():.2f}",
+                seeds_within(costs, limit),
+                f"{fmean(success):.1%}",
+                f"{min(success):.1%}",
+                f"{fmean(each(mine, 'return')):.2f}",
+                f"{fmean(run['seconds'] for run in mine) / 60:.1f}",
+            )
         )
-    return "\n".join(lines)
+    return markdown(heads, rows)
 
 
 def plot(runs: list[dict[str, Any]], path: Path) -> None:
@@ -145,14 +151,8 @@ def plot(runs: list[dict[str, Any]], path: Path) -> None:
 
 def _points(runs: list[dict[str, Any]], algorithm: str) -> np.ndarray:
     """Cost, return and success of each seed of an algorithm."""
-    figures = ("cost/collision", "return", "success")
-    return np.array(
-        [
-            [run["evaluation"][name][0] for name in figures]
-            for run in runs
-            if run["algorithm"] == algorithm
-        ]
-    )
+    mine = [run for run in runs if run["algorithm"] == algorithm]
+    return np.transpose([each(mine, name) for name in ("cost/collision", "return", "success")])
 
 
 def main(config: Config) -> None:

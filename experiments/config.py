@@ -69,8 +69,8 @@ OFF_POLICY: tuple[AlgorithmName, ...] = ("sac-lagrangian", "td3-lagrangian")
 SHIELDED: tuple[AlgorithmName, ...] = ("ppo-shield", "ppo-lagrangian-shield")
 #: Options that a task of the suite sets.
 SET_BY_SUITE = (
-    *("arm", "task", "obstacles", "action", "observation", "paper", "costs", "cost_limit"),
-)
+    "arm", "task", "obstacles", "action", "observation", "paper", "costs", "cost_limit",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -339,21 +339,21 @@ _SUITE_LIMIT_SHARE = 0.7
 #: How ``--help`` groups the options.
 GROUPS = {
     "What to train in": (
-        *("task", "arm", "obstacles", "action", "observation", "physics", "suite_task", "paper"),
+        "task", "arm", "obstacles", "action", "observation", "physics", "suite_task", "paper",
     ),
     "What to train": (
-        *("algorithms", "own_settings", "shield", "cost_limit", "costs", "frames", "seed"),
+        "algorithms", "own_settings", "shield", "cost_limit", "costs", "frames", "seed",
     ),
     "The run": ("out", "resume", "logger", "checkpoint_every", "eval_episodes"),
     "Speed": ("envs", "workers", "jobs"),
     "Learning": (
-        *("frames_per_batch", "epochs", "minibatch", "learning_rate", "gamma", "hidden"),
-        *("first_log_std", "last_log_std", "episode_steps", "demonstrations", "care"),
+        "frames_per_batch", "epochs", "minibatch", "learning_rate", "gamma", "hidden",
+        "first_log_std", "last_log_std", "episode_steps", "demonstrations", "care",
     ),
     "The multiplier": (
-        *("multiplier_rule", "multiplier_init", "multiplier_rate", "limit_share", "pessimism"),
+        "multiplier_rule", "multiplier_init", "multiplier_rate", "limit_share", "pessimism",
     ),
-}
+}  # fmt: skip
 _MORE = (
     "Values shown are the defaults. --help-all says more about each option, with all choices.\n"
     'Example: make train ARGS="--physics mujoco --obstacles human --cost-limit 1"'

@@ -27,7 +27,7 @@ from experiments.agent import num_costs
 from experiments.config import Config as TrainConfig, Engine
 from experiments.environment import make_env
 from experiments.files import write_whole
-from experiments.film import base_env, save_film
+from experiments.film import base_env, check_film, save_film
 from experiments.report import figures_table
 from torchrl_safe._checks import check_count
 from torchrl_safe.envs import ArmEnv
@@ -38,9 +38,9 @@ from torchrl_safe.policy import Policy, load_policy
 
 # The settings of a training run that make its environment. Older files lack some of them.
 _ENVIRONMENT = (
-    *("arm", "task", "obstacles", "action", "observation", "paper"),
-    *("cost_limit", "costs", "limit_share", "suite_task", "physics"),
-)
+    "arm", "task", "obstacles", "action", "observation", "paper",
+    "cost_limit", "costs", "limit_share", "suite_task", "physics",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ class Config:
         check_count(envs=self.envs, shown=self.shown)
         if not all(0 <= limit < math.inf for limit in self.cost_limits):
             raise ValueError(f"cost_limits must not be negative, got {self.cost_limits}.")
-        if self.video is not None and self.video.suffix not in (".gif", ".webp"):
-            raise ValueError(f"video must end in .gif or .webp, got {str(self.video)!r}.")
+        if self.video is not None:
+            check_film("video", self.video)
         if self.physics is not None and self.env is not None:
             raise ValueError(
                 f"physics must not be given with env, got {self.physics!r} and {self.env!r}: "

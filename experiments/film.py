@@ -231,7 +231,15 @@ def _stage(env: EnvBase, times: int) -> tuple[EnvBase, Pace]:
 
 def base_env(env: EnvBase) -> EnvBase:
     """The environment without its transforms."""
-    return env.base_env if isinstance(env, TransformedEnv) else env
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+def check_film(name: str, path: Path) -> None:
+    """Raises ValueError unless :func:`save_film` can write to a file of this name."""
+    if path.suffix not in (".gif", ".webp"):
+        raise ValueError(f"{name} must end in .gif or .webp, got {str(path)!r}.")
 
 
 def _transforms(env: EnvBase) -> list[Any]:

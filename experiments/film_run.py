@@ -14,6 +14,7 @@ import tyro
 
 from experiments import train
 from experiments.config import AlgorithmName, Config as TrainConfig
+from experiments.film import check_film
 from torchrl_safe._checks import check_count
 
 
@@ -35,8 +36,7 @@ class Config:
     """Width of each picture in pixels."""
 
     def __post_init__(self) -> None:
-        if self.out.suffix not in (".gif", ".webp"):
-            raise ValueError(f"out must end in .gif or .webp, got {str(self.out)!r}.")
+        check_film("out", self.out)
         check_count(episodes=self.episodes, width=self.width)
 
 

@@ -132,10 +132,14 @@ def score(rows: Sequence[dict[str, float]], limits: Mapping[str, float]) -> floa
     return fmean(row["return"] for row in ended)
 
 
-def versions() -> dict[str, str]:
-    """What the figures of a run depend on beside its settings."""
+def versions(
+    packages: Sequence[str] = (
+        "torch", "torchrl", "pybullet", "mujoco", "gymnasium", "safety-gymnasium",
+    ),
+) -> dict[str, str]:  # fmt: skip
+    """What the figures of a run depend on beside its settings: versions of what is installed."""
     found = {}
-    for name in ("torch", "torchrl", "pybullet", "mujoco", "gymnasium", "safety-gymnasium"):
+    for name in packages:
         with suppress(PackageNotFoundError):
             found[name] = version(name)
     return found

@@ -21,6 +21,7 @@ from experiments import train
 from experiments.config import Action, AlgorithmName, Config as TrainConfig, Engine, MultiplierRule
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.style import GREY, colour, cost_axis, figure_style, limit_line
+from experiments.tables import markdown
 from torchrl_safe._cores import cores
 
 RULES: dict[MultiplierRule, str] = {"dual-ascent": "DualAscent", "pid": "PIDControl"}
@@ -94,12 +95,12 @@ def points(runs: list[dict[str, Any]]) -> dict[tuple[str, float], np.ndarray]:
 
 def table(runs: list[dict[str, Any]]) -> str:
     """Returns a Markdown table: mean and standard deviation over seeds."""
-    lines = ["| | return | cost | success | multiplier at the end |", "|---" * 5 + "|"]
-    for (rule, value), rows in points(runs).items():
+    rows = []
+    for (rule, value), seeds in points(runs).items():
         name = f"fixed at {value:g}" if rule == "fixed" else f"{rule}, limit {value:g}"
-        cells = (f"{m:.2f} ± {s:.2f}" for m, s in zip(rows.mean(0), rows.std(0), strict=True))
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        cells = (f"{m:.2f} ± {s:.2f}" for m, s in zip(seeds.mean(0), seeds.std(0), strict=True))
+        rows.append((name, *cells))
+    return markdown(("", "return", "cost", "success", "multiplier at the end"), rows)
 
 
 def plot(runs: list[dict[str, Any]], path: Path) -> None:

@@ -26,6 +26,7 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOpe
 from experiments.grid import check_grid, run_grid, save_results
 from experiments.report import LEARNING, Line, mean_of_known, plot_learning
 from experiments.style import colour
+from experiments.tables import markdown
 from torchrl_safe._checks import check_count, check_not_negative
 from torchrl_safe._cores import cores
 from torchrl_safe.envs import PAPER_CARTESIAN, PAPER_JOINT, ActionMode, paper_env
@@ -219,11 +220,12 @@ def per_epoch(run: dict[str, Any], name: str) -> np.ndarray:
 
 def table(runs: list[dict[str, Any]]) -> str:
     """Returns the paper's Table 1, with what it leaves out, in Markdown."""
-    lines = [
-        "| | average cost: paper | authors' code again | here | final success: authors' code again "
-        "| here | evaluated: success | cost | episodes with a touch |",
-        "|---" * 9 + "|",
-    ]
+    heads = (
+        "", "average cost: paper", "authors' code again", "here",
+        "final success: authors' code again", "here",
+        "evaluated: success", "cost", "episodes with a touch",
+    )  # fmt: skip
+    rows = []
     for cell in CELLS:
         mine = [run for run in runs if run["cell"] == cell]
         average = [mean_of_known(per_epoch(run, "cost")) for run in mine]
@@ -232,13 +234,20 @@ def table(runs: list[dict[str, Any]]) -> str:
             name: [run["evaluation"][name] for run in mine]
             for name in ("success", "cost", "touched")
         }
-        lines.append(
-            f"| {cell} | {_spread(*PAPER[cell])} | {_spread(*RERUN[cell])} "
-            f"| {_over_seeds(average)} | {RERUN_SUCCESS[cell]:.2f} | {_over_seeds(late, 2)} "
-            f"| {_over_seeds(test['success'], 2)} | {_over_seeds(test['cost'])} "
-            f"| {np.mean(test['touched']):.0%} |"
+        rows.append(
+            (
+                cell,
+                _spread(*PAPER[cell]),
+                _spread(*RERUN[cell]),
+                _over_seeds(average),
+                f"{RERUN_SUCCESS[cell]:.2f}",
+                _over_seeds(late, 2),
+                _over_seeds(test["success"], 2),
+                _over_seeds(test["cost"]),
+                f"{np.mean(test['touched']):.0%}",
+            )
         )
-    return "\n".join(lines)
+    return markdown(heads, rows)
 
 
 def plot(runs: list[dict[str, Any]], path: Path, cost_limit: float) -> None:

@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from experiments.config import SHIELDED
 from experiments.style import colour, cost_axis, figure_style, label, label_ends, limit_line
+from experiments.tables import markdown
 from torchrl_safe.metrics import mean
 
 _CURVES = {
@@ -44,39 +45,28 @@ def table(results: dict[str, Any]) -> str:
 def figures_table(rows: dict[str, dict[str, list[float]]], cost_limits: Mapping[str, float]) -> str:
     """Returns a Markdown table of named rows of figures, each with its interval or without."""
     columns = list(next(iter(rows.values())))
-    lines = [
-        "| evaluation | " + " | ".join(_heading(column) for column in columns) + " |",
-        "|---" * (len(columns) + 1) + "|",
-    ]
-    for name, row in rows.items():
-        cells = (
-            _cell(*row[column], share=_is_share(column)) if column in row else ""
-            for column in columns
-        )
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    text = markdown(
+        ("evaluation", *map(_heading, columns)),
+        [
+            (
+                name,
+                *(_cell(*row[c], share=_is_share(c)) if c in row else "" for c in columns),
+            )
+            for name, row in rows.items()
+        ],
+    )
     if len(cost_limits) == 1:
         (limit,) = cost_limits.values()
         shown = f"limit {limit:g}"
     else:
         shown = "limits " + ", ".join(f"{name} {limit:g}" for name, limit in cost_limits.items())
-    lines.append(f"\nCost {shown}; brackets: 95 % confidence.")
-    return "\n".join(lines)
+    return f"{text}\n\nCost {shown}; brackets: 95 % confidence."
 
 
 def episode_costs(runs: list[dict[str, Any]]) -> torch.Tensor:
     """Costs of the evaluated episodes of some runs, shape (seeds, episodes)."""
     costs = torch.tensor([run["episodes"]["episode_cost"] for run in runs])
     return costs.reshape(costs.shape[:2])  # Raises if there are several costs.
-
-
-def successes(runs: list[dict[str, Any]]) -> list[float]:
-    """Share of the evaluated episodes that reach the target, for each run."""
-    return [run["evaluation"]["success"][0] for run in runs]
-
-
-def shown_cost(cost: float, limit: float) -> str:
-    """A cost for a table, bold above its limit."""
-    return f"**{cost:.2f}**" if cost > limit else f"{cost:.2f}"
 
 
 def mean_over_seeds(costs: torch.Tensor) -> str:

@@ -7,7 +7,6 @@ missing. Needs OmniSafe, which ``make safe-gym-grid`` installs.
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 from collections.abc import Mapping
 from itertools import product
@@ -19,8 +18,8 @@ import torch
 import tyro
 
 from experiments import safe_gym
-from experiments.files import write_whole
-from experiments.grid import check_grid, run_grid
+from experiments.grid import check_grid, run_grid, save_results
+from experiments.tables import markdown
 from torchrl_safe._cores import cores
 
 Library = Literal["ours", "omnisafe"]
@@ -144,28 +143,22 @@ def jobs(config: Config) -> dict[Path, tuple[Run]]:
 
 def table(runs: list[dict[str, Any]], config: Config) -> str:
     """Returns a Markdown table with a row for each environment and library."""
-    lines = [
-        f"| environment | PPO-Lagrangian | return | cost (limit {config.cost_limit:g}) "
-        "| CPU minutes |",
-        "|---" * 5 + "|",
-    ]
+    rows = []
     for env, library in product(config.envs, config.libraries):
         mine = [run for run in runs if (run["env"], run["library"]) == (env, library)]
         returns, costs = (", ".join(f"{run[k]:.1f}" for run in mine) for k in ("return", "cost"))
         # One thread each: what a run takes on a core of its own.
         minutes = sum(run["cpu_seconds"] for run in mine) / len(mine) / 60
-        lines.append(f"| {env} | {library} | {returns} | {costs} | {minutes:.1f} |")
-    return "\n".join(lines)
+        rows.append((env, library, returns, costs, f"{minutes:.1f}"))
+    cost = f"cost (limit {config.cost_limit:g})"
+    text = markdown(("environment", "PPO-Lagrangian", "return", cost, "CPU minutes"), rows)
+    return f"{text}\n\nSeeds side by side, means of the last tenth of training."
 
 
 def main(config: Config) -> None:
-    """Runs what is missing, then writes the table and a line of JSON for each run."""
+    """Runs what is missing, then writes table and results.json."""
     runs = run_grid(run, jobs(config), workers=config.jobs, name="safe-gym")
-    lines = "".join(f"{json.dumps(run)}\n" for run in runs)
-    write_whole(config.out / "results.jsonl", lines)
-    text = table(runs, config)
-    write_whole(config.out / "table.md", text)
-    print(f"{text}\n\nSeeds side by side, means of the last tenth of training.")
+    save_results(config.out, config, runs, table(runs, config))
 
 
 if __name__ == "__main__":

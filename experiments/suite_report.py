@@ -20,8 +20,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.report import shown_cost
 from experiments.style import colour, figure_style, label, limit_line
+from experiments.tables import each, markdown, shown_cost
 from torchrl_safe.envs import SUITE
 from torchrl_safe.metrics import Estimate, interquartile_mean, mean
 
@@ -49,27 +49,33 @@ def report(runs: Sequence[Run], limits: Limits) -> str:
 
 def shield_table(runs: Sequence[Run]) -> str:
     """Returns a Markdown table of what a shield changes: collisions of all training, and after."""
-    lines = [
-        "| task | algorithm | seeds | collisions while training | success | return "
-        "| without its shield: success | collisions of an episode |",
-        "|---" * 8 + "|",
-    ]
+    heads = (
+        "task", "algorithm", "seeds", "collisions while training", "success", "return",
+        "without its shield: success", "collisions of an episode",
+    )  # fmt: skip
+    rows = []
     for task, algorithm in _cells(runs):
         mine = _select(runs, task, algorithm)
         if "cost/collision" not in mine[0]["evaluation"]:
             continue
-        figures = [_mean_of(mine, "evaluation", name) for name in ("success", "return")]
         without = ["", ""]
         if "without_shield" in mine[0]:
             success, cost = (
                 _mean_of(mine, "without_shield", name) for name in ("success", "cost/collision")
             )
             without = [f"{success:.1%}", f"{cost:.2f}"]
-        lines.append(
-            f"| {task} | {algorithm} | {len(mine)} | {_summed(mine, 'collision'):,.0f} "
-            f"| {figures[0]:.1%} | {figures[1]:.2f} | {without[0]} | {without[1]} |"
+        rows.append(
+            (
+                task,
+                algorithm,
+                str(len(mine)),
+                f"{_summed(mine, 'collision'):,.0f}",
+                f"{_mean_of(mine, 'evaluation', 'success'):.1%}",
+                f"{_mean_of(mine, 'evaluation', 'return'):.2f}",
+                *without,
+            )
         )
-    return "\n".join(lines)
+    return markdown(heads, rows)
 
 
 def table(runs: Sequence[Run], limits: Limits) -> str:
@@ -82,28 +88,28 @@ def table(runs: Sequence[Run], limits: Limits) -> str:
         *(f"cost, {name}" for name in algorithms),
         *(f"success, {name}, %" for name in algorithms),
     ]
-    lines = [f"| task | cost | limit | {' | '.join(heads)} |", "|---" * (3 + len(heads)) + "|"]
+    rows = []
     for task in _tasks(runs):
         of_task = [_select(runs, task, algorithm) for algorithm in algorithms]
-        success = [", ".join(map(_percent, _each(mine, "success"))) for mine in of_task]
+        success = [", ".join(map(_percent, each(mine, "success"))) for mine in of_task]
         head = f"`{task}`"
         for name, limit in limits[task].items():
             costs = [
-                ", ".join(shown_cost(cost, limit) for cost in _each(mine, f"cost/{name}"))
+                ", ".join(shown_cost(cost, limit) for cost in each(mine, f"cost/{name}"))
                 for mine in of_task
             ]
-            lines.append(f"| {head} | {name} | {limit:g} | {' | '.join([*costs, *success])} |")
+            rows.append((head, name, f"{limit:g}", *costs, *success))
             head, success = "", ["" for _ in algorithms]
-    return "\n".join(lines)
+    return markdown(("task", "cost", "limit", *heads), rows)
 
 
 def whole(runs: Sequence[Run], limits: Limits) -> str:
     """Returns a Markdown table with a row for each algorithm, over all tasks."""
-    lines = [
-        "| algorithm | success (IQM) | largest cost / limit (IQM) | runs above a limit "
-        "| tasks with a cost of three limits or more | cost while training / PPO's |",
-        "|---" * 6 + "|",
-    ]
+    heads = (
+        "algorithm", "success (IQM)", "largest cost / limit (IQM)", "runs above a limit",
+        "tasks with a cost of three limits or more", "cost while training / PPO's",
+    )  # fmt: skip
+    rows = []
     algorithms = _algorithms(runs)
     for algorithm in algorithms:
         success, largest = scores(runs, limits, algorithm)
@@ -118,15 +124,20 @@ def whole(runs: Sequence[Run], limits: Limits) -> str:
             for task in _tasks(runs)
         )
         training = "" if "ppo" not in algorithms else f"{_relative(runs, limits, algorithm):.2f}"
-        lines.append(
-            f"| {algorithm} | {_shown(middle, '.1%')} | {_shown(high, '.2f')} "
-            f"| {_shown(above, '.0%')} | {threefold}/{len(_tasks(runs))} | {training} |"
+        rows.append(
+            (
+                algorithm,
+                _shown(middle, ".1%"),
+                _shown(high, ".2f"),
+                _shown(above, ".0%"),
+                f"{threefold}/{len(_tasks(runs))}",
+                training,
+            )
         )
-    lines.append(
-        "\nIQM: interquartile mean over all runs. Brackets: 95 % stratified bootstrap. A run is "
-        "above a limit if the mean of one of its costs is."
+    return (
+        f"{markdown(heads, rows)}\n\nIQM: interquartile mean over all runs. Brackets: 95 % "
+        "stratified bootstrap. A run is above a limit if the mean of one of its costs is."
     )
-    return "\n".join(lines)
 
 
 def scores(
@@ -248,11 +259,7 @@ def _select(runs: Sequence[Run], task: str, algorithm: str) -> list[Run]:
 
 
 def _mean_of(runs: Sequence[Run], part: str, name: str) -> float:
-    return float(np.mean(_each(runs, name, part)))
-
-
-def _each(runs: Sequence[Run], name: str, part: str = "evaluation") -> list[float]:
-    return [run[part][name][0] for run in runs]
+    return float(np.mean(each(runs, name, part)))
 
 
 def _percent(share: float) -> str:

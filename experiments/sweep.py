@@ -11,11 +11,11 @@ import math
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-import torch
 import tyro
 from matplotlib.colors import to_hex
 
@@ -28,9 +28,9 @@ from experiments.report import (
     mean_over_seeds,
     plot_learning,
     seeds_within,
-    successes,
 )
 from experiments.style import ALARM, INK, colour, cost_axis, figure_style, label, label_ends
+from experiments.tables import each, markdown
 from torchrl_safe._cores import cores
 from torchrl_safe.metrics import mean, worst_seed
 
@@ -105,25 +105,30 @@ def names(config: Config) -> Iterable[tuple[int, Action, float | None]]:
 
 def table(runs: list[dict[str, Any]], config: Config) -> str:
     """Returns a Markdown table with a row for each action and limit."""
-    lines = [
-        "| action | limit | seeds within | worst seed | cost (95 % over seeds) | success "
-        "| lowest | return | multiplier |",
-        "|---" * 9 + "|",
-    ]
+    heads = (
+        "action", "limit", "seeds within", "worst seed", "cost (95 % over seeds)", "success",
+        "lowest", "return", "multiplier",
+    )  # fmt: skip
+    rows = []
     for action, limit in product(config.actions, (*config.limits, None)):
         mine = _select(runs, action, limit)
         costs = episode_costs(mine)
-        kept = "" if limit is None else seeds_within(costs, limit)
-        returns = torch.tensor([run["evaluation"]["return"][0] for run in mine])
         multipliers = [run["history"][-1]["multiplier/collision"] for run in mine]
-        success = successes(mine)
-        lines.append(
-            f"| {action} | {'none (PPO)' if limit is None else f'{limit:g}'} | {kept} "
-            f"| {worst_seed(costs.unsqueeze(-1)).value.item():.2f} | {mean_over_seeds(costs)} "
-            f"| {sum(success) / len(success):.1%} | {min(success):.1%} | {returns.mean():.2f} "
-            f"| {min(multipliers):.2f} to {max(multipliers):.2f} |"
+        success = each(mine, "success")
+        rows.append(
+            (
+                action,
+                "none (PPO)" if limit is None else f"{limit:g}",
+                "" if limit is None else seeds_within(costs, limit),
+                f"{worst_seed(costs.unsqueeze(-1)).value.item():.2f}",
+                mean_over_seeds(costs),
+                f"{fmean(success):.1%}",
+                f"{min(success):.1%}",
+                f"{fmean(each(mine, 'return')):.2f}",
+                f"{min(multipliers):.2f} to {max(multipliers):.2f}",
+            )
         )
-    return "\n".join(lines)
+    return markdown(heads, rows)
 
 
 def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
@@ -173,7 +178,7 @@ def plot(runs: list[dict[str, Any]], config: Config, path: Path) -> None:
             axis.set(title=f"{action.capitalize()} actions", xlabel="cost limit")
             figure.canvas.draw()
             nearest = _select(runs, action, max(config.limits))
-            middle = sum(r["evaluation"]["cost/collision"][0] for r in nearest) / len(nearest)
+            middle = fmean(each(nearest, "cost/collision"))
             label_ends(
                 axis,
                 [

@@ -23,8 +23,8 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from experiments.algorithms import ALGORITHMS, no_transforms
 from experiments.environment import PHYSICS
 from experiments.grid import check_grid, run_grid, save_results
-from experiments.report import shown_cost
 from experiments.suite_report import excess
+from experiments.tables import markdown, shown_cost
 from torchrl_safe._checks import check_count
 from torchrl_safe._cores import cores
 from torchrl_safe.envs import (
@@ -261,19 +261,15 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
     figures = {(run["policy"], run["condition"]): run["evaluation"] for run in runs}
     limits = {policy: SUITE[task].cost_limits for policy, task in policies}
     shown = [", ".join(f"{n} {limit:g}" for n, limit in each.items()) for each in limits.values()]
-    lines = [
-        f"| | {' | '.join(limits)} | within every limit |",
-        "|---" * (2 + len(limits)) + "|",
-        f"| limits | {' | '.join(shown)} | |",
-    ]
+    rows = [("limits", *shown, "")]
     for condition in conditions:
         row = {name: figures[name, condition] for name in limits}
         played = {name: each for name, each in row.items() if each is not None}
         kept = sum(excess(each, limits[name]) <= 1 for name, each in played.items())
         cells = [_cell(each, limits[name]) for name, each in row.items()]
-        lines.append(f"| {condition} | {' | '.join(cells)} | {kept}/{len(played)} |")
-    lines.append("\nSuccess; the mean of each cost, bold where it is above its limit.")
-    return "\n".join(lines)
+        rows.append((condition, *cells, f"{kept}/{len(played)}"))
+    text = markdown(("", *limits, "within every limit"), rows)
+    return f"{text}\n\nSuccess; the mean of each cost, bold where it is above its limit."
 
 
 def name_of(policy: str) -> str:

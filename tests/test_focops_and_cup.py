@@ -9,7 +9,7 @@ from first_order import actor_gradient, build, old_policy, policy, shift, step
 from on_policy import estimated, train
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch.distributions import kl_divergence
-from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.modules import IndependentNormal, ProbabilisticActor, recurrent_mode
 from torchrl.objectives import SoftUpdate
 
 from torchrl_safe.objectives import CUPLoss, FOCOPSLoss, IPOLoss, P3OLoss, penalized_advantage
@@ -93,6 +93,18 @@ def test_cup_projects_by_hand(functional):
     reached = {name for name, p in loss.named_parameters() if p.grad is not None and p.grad.any()}
     assert reached
     assert all(name.startswith("actor_network") for name in reached)
+
+
+def test_the_projection_of_a_recurrent_actor_sees_whole_sequences():
+    """TorchRL turns recurrent mode on around methods whose names end in "loss"."""
+    loss, modes = build(CUPLoss), []
+    data = estimated(loss)
+    loss.start_projection()
+    for module in loss.actor_network.modules():
+        module.register_forward_pre_hook(lambda *_: modes.append(recurrent_mode()))
+    loss.projection_loss(data)
+    assert modes
+    assert all(modes)
 
 
 def test_cup_does_not_project_before_the_start_of_a_projection():

@@ -63,6 +63,13 @@ def check_kind(name: str, value: Any, kind: type | UnionType, *, such_as: str = 
         raise TypeError(f"{name} must be an instance of {names}, got {value!r}{lacks}.{hint}")
 
 
+def check_callable(name: str, value: Any) -> None:
+    """Raises TypeError unless the value is an object that can be called, not a class."""
+    if isinstance(value, type) or not callable(value):
+        kind = ", a class and not an object" if isinstance(value, type) else ""
+        raise TypeError(f"{name} must be a callable object, got {value!r}{kind}.")
+
+
 def check_array(name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Returns the values as an array; raises ValueError unless they have a shape and are finite.
 

@@ -7,7 +7,14 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchrl_safe._checks import as_number, check_flag, check_positive, check_unit, keep_numbers
+from torchrl_safe._checks import (
+    as_number,
+    check_callable,
+    check_flag,
+    check_positive,
+    check_unit,
+    keep_numbers,
+)
 from torchrl_safe.envs.kinematics import DampedLeastSquares, InverseKinematics
 from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.rotations import UPRIGHT, from_rotation_vector, multiply
@@ -107,10 +114,7 @@ class CartesianDelta:
     def __post_init__(self) -> None:
         check_positive(step=self.step)
         check_bound(self.bound)
-        if isinstance(self.inverse_kinematics, type) or not callable(self.inverse_kinematics):
-            raise TypeError(
-                f"inverse_kinematics must be a callable object, got {self.inverse_kinematics!r}."
-            )
+        check_callable("inverse_kinematics", self.inverse_kinematics)
         if self.orientation is not None:
             check_unit("orientation", keep_numbers(self, "orientation", 4))
         for name in ("yaw_step", "rotation_step", "finger_step"):

@@ -19,7 +19,7 @@ from torchrl._utils import seed_generator
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_safe._checks import check_array, check_count, check_flag, check_kind
+from torchrl_safe._checks import check_array, check_callable, check_count, check_flag, check_kind
 from torchrl_safe.envs.actions import ActionMode, CartesianDelta, check_bound
 from torchrl_safe.envs.arms import PANDA, ArmModel
 from torchrl_safe.envs.costs import Collision
@@ -148,9 +148,7 @@ class ArmEnv(EnvBase):
             raise TypeError(f"costs must have names that are strings, got {wrong}.")
         named = [(f"cost {name!r}", cost) for name, cost in costs.items()]
         for name, function in [*named, ("observation", observation)]:
-            if isinstance(function, type) or not callable(function):
-                kind = ", a class and not an object" if isinstance(function, type) else ""
-                raise TypeError(f"{name} must be a callable object, got {function!r}{kind}.")
+            check_callable(name, function)
         check_bound(action.bound)
         check_shapes("shapes of obstacles", obstacles.shapes)
         check_shapes("objects of task", task.objects, movable=True)

@@ -27,7 +27,7 @@ def check_number(name: str, value: Any, least: float = 0.0, most: float = LARGES
 
     Always a float: a buffer made of an integer would hold integers for ever.
     """
-    number = as_number(value)
+    number = as_scalar(value)
     if not least <= number <= most:
         raise ValueError(f"{name} must be a number from {least:g} to {most:g}, got {value!r}.")
     return number
@@ -56,7 +56,7 @@ def check_length_known(episode_length: float | None, gamma: Tensor) -> None:
         )
 
 
-def as_number(value: Any) -> float:
+def as_scalar(value: Any) -> float:
     """The value of a number or of a tensor with one element, NaN of anything else."""
     if isinstance(value, Tensor):
         return float(value.detach()) if value.numel() == 1 and not value.is_complex() else math.nan

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe.objectives._checks import SMALLEST, as_number, check_number
+from torchrl_safe.objectives._checks import SMALLEST, as_scalar, check_number
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.functional import penalized_advantage
 from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
@@ -119,7 +119,7 @@ class FOCOPSLoss(ConstrainedPPO, PPOLoss):
             **kwargs,
         )
         temperature = check_number("temperature", temperature, SMALLEST)
-        if not as_number(kl_bound) > 0:
+        if not as_scalar(kl_bound) > 0:
             raise ValueError(f"kl_bound must be positive, got {kl_bound!r}.")
         device = self.cost_critic_coeff.device
         self.register_coeff_buffer("temperature", temperature, device=device)

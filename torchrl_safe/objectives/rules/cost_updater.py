@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_safe._checks import as_tensor, check_names, check_one_each
-from torchrl_safe.objectives._checks import as_number, check_number, uncompiled
+from torchrl_safe.objectives._checks import as_scalar, check_number, uncompiled
 
 #: Which updaters write which buffer of a loss.
 _UPDATERS = {
@@ -207,4 +207,4 @@ def _in_order(cost_limit: Mapping[str, float], names: tuple[str, ...] | None) ->
             f"cost_limit must have a limit for each of cost_names {names}, got {cost_limit!r}: "
             f"missing {missing}, unknown {sorted(map(str, unknown))}."
         )
-    return [as_number(cost_limit[name]) for name in names]
+    return [as_scalar(cost_limit[name]) for name in names]

@@ -14,7 +14,7 @@ from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
 from torchrl_safe._checks import check_flag, check_kind
-from torchrl_safe.objectives._checks import SMALLEST, as_number, check_number
+from torchrl_safe.objectives._checks import SMALLEST, as_scalar, check_number
 from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
 # A relative violation is divided by at least this share of the limit.
@@ -187,7 +187,7 @@ class MultiplierUpdater(CostUpdater):
 
 
 def _check_bound(bound: float | None) -> float | None:
-    if bound is None or as_number(bound) == math.inf:
+    if bound is None or as_scalar(bound) == math.inf:
         return bound
     return check_number("max_multiplier", bound, SMALLEST)
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._checks import as_number, check_number
+from torchrl_safe.objectives._checks import as_scalar, check_number
 from torchrl_safe.objectives.rules.multipliers import MultiplierUpdater
 
 
@@ -133,9 +133,9 @@ class PIDControl(MultiplierUpdater):
         self.kp, self.ki, self.kd = (
             check_number(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd))
         )
-        if not 0 <= as_number(smoothing) < 1:
+        if not 0 <= as_scalar(smoothing) < 1:
             raise ValueError(f"smoothing must be at least 0 and less than 1, got {smoothing!r}.")
-        self.smoothing = as_number(smoothing)
+        self.smoothing = as_scalar(smoothing)
         multiplier = loss_module.lagrange_multiplier
         self.integral = self._parameter(multiplier).clone()
         # NaN until there has been a batch.

@@ -128,7 +128,7 @@ class TrustRegionLoss(ConstrainedPPO, PPOLoss):
             KeyError: if a value target is missing.
         """
         tensordict = tensordict.clone(False)
-        with set_recurrent_mode(True):  # As TorchRL has it around a loss.
+        with set_recurrent_mode(True):  # TorchRL does so where a name ends in "loss".
             tensordict.update(self.actor_features(tensordict))
             losses = {"loss_cost_critic": self.loss_cost_critic(tensordict)[0]}
             if self.critic_coeff is not None:

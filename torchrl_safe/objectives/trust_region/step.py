@@ -16,7 +16,7 @@ from torchrl.objectives import PPOLoss
 from torchrl_safe._checks import check_count, check_kind
 from torchrl_safe.objectives._checks import (
     SMALLEST,
-    as_number,
+    as_scalar,
     check_episode_length,
     check_length_known,
     check_number,
@@ -164,7 +164,7 @@ class TrustRegionStep:
             raise ValueError(f"dtype must be a floating-point torch.dtype, got {dtype!r}.")
         check_count(cg_iterations=cg_iterations)
         check_count(max_backtracks=max_backtracks, least=0)
-        if not 0 < as_number(shrink) < 1:
+        if not 0 < as_scalar(shrink) < 1:
             raise ValueError(f"shrink must be more than 0 and less than 1, got {shrink!r}.")
         self.loss_module = loss_module
         self.method = method
@@ -172,7 +172,7 @@ class TrustRegionStep:
         self.max_kl = max_kl
         self.damping = check_number("damping", damping)
         self.cg_iterations = cg_iterations
-        self.shrink = as_number(shrink)
+        self.shrink = as_scalar(shrink)
         self.max_backtracks = max_backtracks
         self.dtype = dtype
         self.rejected_steps = 0

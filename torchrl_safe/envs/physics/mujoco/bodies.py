@@ -24,12 +24,12 @@ from torchrl_safe.envs.physics.scene import TABLE_CENTRE, TABLE_SHAPE
 TABLE = "scene/table"
 
 
-def obstacle(index: int) -> str:
+def obstacle_name(index: int) -> str:
     """Name of an obstacle, and of its shape."""
     return f"obstacle/{index}"
 
 
-def thing(index: int) -> str:
+def object_name(index: int) -> str:
     """Name of an object that the task moves, and of its shape."""
     return f"object/{index}"
 
@@ -50,18 +50,18 @@ def add_obstacle(spec: Any, index: int, shape: Shape, *, reach: float) -> None:
         shape: its shape.
         reach: distance from which on contacts with it are found, m.
     """
-    _add_body(spec, obstacle(index), shape, OBSTACLE, reach)
+    _add_body(spec, obstacle_name(index), shape, OBSTACLE, reach)
 
 
 def add_object(spec: Any, index: int, shape: Shape) -> None:
     """Adds an object that the task moves."""
-    _add_body(spec, thing(index), shape, OBJECT, 0.0)
+    _add_body(spec, object_name(index), shape, OBJECT, 0.0)
 
 
 def add_parts(spec: Any, shapes: Sequence[Shape], objects: Sequence[Shape]) -> None:
     """Adds what is drawn with obstacles and objects, and collides with nothing."""
-    names = [(obstacle(index), shape, OBSTACLE) for index, shape in enumerate(shapes)]
-    names += [(thing(index), shape, OBJECT) for index, shape in enumerate(objects)]
+    names = [(obstacle_name(index), shape, OBSTACLE) for index, shape in enumerate(shapes)]
+    names += [(object_name(index), shape, OBJECT) for index, shape in enumerate(objects)]
     for name, shape, default in names:
         for part in shape.look.parts if shape.look is not None else ():
             spec.body(name).add_geom(

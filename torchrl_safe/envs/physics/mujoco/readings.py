@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.arm import ArmParts
-from torchrl_safe.envs.physics.mujoco.bodies import TABLE, obstacle
+from torchrl_safe.envs.physics.mujoco.bodies import TABLE, obstacle_name
 from torchrl_safe.envs.physics.mujoco.engine import mujoco
 from torchrl_safe.envs.physics.paths import Ways
 from torchrl_safe.envs.physics.rows import places
@@ -51,7 +51,7 @@ class Sensors:
             # With the arm's base too if the obstacle is free.
             arm = parts.root if shape.mass else parts.moving
             geom = mujoco.mjtObj.mjOBJ_GEOM
-            self._add_contact(arm, geom, obstacle(index), _SLOTS, ("FOUND", "FORCE", "DIST"))
+            self._add_contact(arm, geom, obstacle_name(index), _SLOTS, ("FOUND", "FORCE", "DIST"))
         self._shapes["contacts"] = (len(shapes), _SLOTS, 5)
         if sensing.clearance:
             self._add_distances(solids, shapes, sensing.clearance)
@@ -90,7 +90,7 @@ class Sensors:
                     objtype=mujoco.mjtObj.mjOBJ_GEOM,
                     objname=name,
                     reftype=mujoco.mjtObj.mjOBJ_GEOM,
-                    refname=obstacle(index),
+                    refname=obstacle_name(index),
                     cutoff=reach,
                 )
         self._shapes["closest"] = (len(shapes), len(solids), 2, 3)

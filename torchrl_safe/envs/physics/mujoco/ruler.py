@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles.shapes import Shape
 from torchrl_safe.envs.physics.mujoco.arm import name_solids, read_arm
-from torchrl_safe.envs.physics.mujoco.bodies import TABLE, add_obstacle, obstacle
+from torchrl_safe.envs.physics.mujoco.bodies import TABLE, add_obstacle, obstacle_name
 from torchrl_safe.envs.physics.mujoco.contacts import level_bodies
 from torchrl_safe.envs.physics.mujoco.engine import make_batch, mujoco, quiet
 from torchrl_safe.envs.physics.scene import Scene
@@ -78,25 +78,25 @@ class Ruler:
         mujoco.mj_kinematics(model, data)
         level = level_bodies(model, data)
         body = {name: int(model.geom(name).bodyid[0]) for name in names}
-        things = [*(obstacle(index) for index in range(len(shapes))), TABLE]
+        others = [*(obstacle_name(index) for index in range(len(shapes))), TABLE]
         # Leave out what no joint moves, and the table for what only turns about vertical axes.
         pairs = [
-            (name, thing)
-            for thing in things
+            (name, other)
+            for other in others
             for name in names
-            if moved[body[name]].any() and not (thing == TABLE and body[name] in level)
+            if moved[body[name]].any() and not (other == TABLE and body[name] in level)
         ]
-        for name, thing in pairs:
+        for name, other in pairs:
             spec.add_sensor(
                 type=mujoco.mjtSensor.mjSENS_GEOMFROMTO,
                 objtype=mujoco.mjtObj.mjOBJ_GEOM,
                 objname=name,
                 reftype=mujoco.mjtObj.mjOBJ_GEOM,
-                refname=thing,
+                refname=other,
                 cutoff=reach,
             )
         model = spec.compile()
-        self._thing = np.array([things.index(thing) for _, thing in pairs], dtype=int)
+        self._other = np.array([others.index(other) for _, other in pairs], dtype=int)
         geoms = np.array([model.geom(name).id for name, _ in pairs], dtype=int)
         self._geom, self._moves = geoms, moved[model.geom_bodyid[geoms]]
         self._joints, self._slides = joints, model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -130,7 +130,7 @@ class Ruler:
             named = None if len(rows) == len(self._qpos) else rows.tolist()
             self._batch.forward(named, stage=mujoco.mjtStage.mjSTAGE_POS)
         worlds = rows[:, None]
-        ends = self._points[rows].reshape(len(rows), len(self._thing), 2, 3)
+        ends = self._points[rows].reshape(len(rows), len(self._other), 2, 3)
         point, way = ends[:, :, 0], ends[:, :, 0] - ends[:, :, 1]
         distance = np.sqrt(np.einsum("kri,kri->kr", way, way))
         found = ends.any(axis=(2, 3))
@@ -141,4 +141,4 @@ class Ruler:
         distance *= sign
         anchor, axis = self._anchors[worlds, self._joints], self._axes[worlds, self._joints]
         jacobian = distance_jacobian(point, normal, anchor, axis, self._slides) * self._moves
-        return Nearest(np.where(found, distance, np.inf), normal, point, jacobian, self._thing)
+        return Nearest(np.where(found, distance, np.inf), normal, point, jacobian, self._other)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchrl_safe.envs.arms import ArmModel
 from torchrl_safe.envs.obstacles import Placement
 from torchrl_safe.envs.obstacles.shapes import Shape
-from torchrl_safe.envs.physics.mujoco.bodies import obstacle, thing
+from torchrl_safe.envs.physics.mujoco.bodies import object_name, obstacle_name
 from torchrl_safe.envs.physics.mujoco.chain import Chain, ToolPose
 from torchrl_safe.envs.physics.mujoco.clearance import Clearance
 from torchrl_safe.envs.physics.mujoco.engine import make_batch, mujoco, quiet
@@ -79,7 +79,9 @@ class MuJoCoSimulator:
         self._controls = np.zeros((num_envs, frame_skip, model.nu))
         self._fingers_rest = False  # Whether their motors do.
         self._clearance = Clearance(
-            model, [*map(obstacle, range(len(shapes)))], [*map(thing, range(len(objects)))]
+            model,
+            [*map(obstacle_name, range(len(shapes)))],
+            [*map(object_name, range(len(objects)))],
         )
         self._ruler: Ruler | None = None
         if reach is not None:
@@ -105,9 +107,9 @@ class MuJoCoSimulator:
         self._is_free = np.array([shape.mass > 0 for shape in shapes], dtype=bool)
         self._some_free = bool(self._is_free.any())
         self._tracks = Tracks(num_envs, len(shapes), frame_skip)
-        self._objects = FreeBodies(model, [thing(index) for index in range(len(objects))])
+        self._objects = FreeBodies(model, [object_name(index) for index in range(len(objects))])
         self._free = FreeBodies(
-            model, [obstacle(i) for i in np.flatnonzero(self._is_free).tolist()]
+            model, [obstacle_name(i) for i in np.flatnonzero(self._is_free).tolist()]
         )
         self._goal = np.zeros((num_envs, 3))
         self._steps = np.zeros(num_envs, dtype=int)
@@ -403,7 +405,7 @@ class MuJoCoSimulator:
     def pictures(self, camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
         """Returns an RGB picture of every world."""
         if self._painter is None:
-            names = [obstacle(index) for index in range(len(self._sizes))]
+            names = [obstacle_name(index) for index in range(len(self._sizes))]
             self._painter = Painter(build_scenery(*self._build), names)
         return self._painter.paint(
             self._qpos, self._mocap_pos, self._mocap_quat, self._goal,
