@@ -1,7 +1,7 @@
 """Puts suites that were run in several places into one: ``python -m experiments.suite_merge``.
 
-``docs/results/suite.json`` has the runs of docs/benchmarks/suite.md. Add runs of yours, with the same seeds of
-both algorithms::
+``docs/results/suite.json`` has the runs of docs/benchmarks/suite.md. Add runs of yours, with the
+same seeds of both algorithms::
 
     python -m experiments.suite_merge --results docs/results/suite.json runs/suite/results.json
 """

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from inspect import Parameter, signature
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,6 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Distribution
 from torchrl.objectives import PPOLoss
 
 from torchrl_safe._checks import check_flag
@@ -24,7 +23,7 @@ from torchrl_safe.objectives._checks import get_or_raise, initial_multiplier
 from torchrl_safe.objectives._reduction import report_each
 from torchrl_safe.objectives.critics.cost_critic import CostCritic, CostKeys
 from torchrl_safe.objectives.functional import cost_advantage_scale, penalized_advantage
-from torchrl_safe.objectives.on_policy.policies import summed
+from torchrl_safe.objectives.on_policy.policies import Evaluated, Policy, evaluate
 
 
 class ConstrainedLoss(CostCritic):
@@ -134,39 +133,6 @@ class ConstrainedLoss(CostCritic):
         return [*self.policy_out_keys, *super()._own_out_keys(), *reported]
 
 
-class Policy(NamedTuple):
-    """The policy in the states of a batch: evaluated once for all that a loss asks of it.
-
-    ``log_ratio`` is the logarithm of the ratio that PPO clips, to the proximal policy, and
-    ``log_correction`` what makes it that to the policy that collected the batch, or ``None`` if
-    these two are one (see ``delay_actor`` and ``max_importance_ratio`` of TorchRL's losses). Both
-    have shape ``(*B, 1)``, or ``(*B, ..., 1)`` if the log-probability has more than one number.
-    """
-
-    log_ratio: Tensor
-    distribution: Distribution
-    kl_approx: Tensor
-    log_correction: Tensor | None
-
-    def ratio(self) -> Tensor:
-        """Ratio to the policy that collected the batch, shape ``(*B, 1)``."""
-        if self.log_correction is None:
-            return self.log_ratio.exp()
-        return (self.log_ratio + self.log_correction).exp()
-
-    def joint(self, shape: torch.Size) -> Policy:
-        """The same with one ratio for each state; ``shape`` is that of the states.
-
-        PPO clips the ratio of each part of an action by itself if the log-probability is not one
-        number, as that of :class:`torch.distributions.Normal`.
-        """
-        correction = self.log_correction
-        return self._replace(
-            log_ratio=summed(self.log_ratio, shape),
-            log_correction=None if correction is None else summed(correction, shape),
-        )
-
-
 @dataclass
 class PPOKeys(CostKeys, PPOLoss._AcceptedKeys):
     """The keys of the costs and those of PPO."""
@@ -224,7 +190,7 @@ class ConstrainedPPO(ConstrainedLoss):
         """The parent's outputs, for this advantage of shape ``(*B, 1)``."""
         policy = self.evaluate(tensordict) if policy is None else policy
         tensordict = tensordict.set(self.tensor_keys.advantage, advantage)
-        return self.parent_forward(_Evaluated(self, policy), tensordict)
+        return self.parent_forward(Evaluated(self, policy), tensordict)
 
     def _advantages(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         estimated = not self._has_advantages(tensordict)
@@ -233,46 +199,3 @@ class ConstrainedPPO(ConstrainedLoss):
         # within its forward only, where the costs are mixed in already.
         advantage = self._maybe_normalize_advantage(advantage, tensordict, update_norm=estimated)
         return advantage, cost_advantage
-
-
-class _Evaluated:
-    """What TorchRL's forward gets as ``self``: the loss, with policy and advantage ready."""
-
-    def __init__(self, loss: PPOLoss, policy: Policy) -> None:
-        self._loss = loss
-        self._policy = policy
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._loss, name)
-
-    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> Policy:
-        return self._policy
-
-    def _maybe_normalize_advantage(
-        self, advantage: Tensor, tensordict: TensorDictBase, *, update_norm: bool
-    ) -> Tensor:
-        return advantage
-
-
-def evaluate(
-    loss: PPOLoss, tensordict: TensorDictBase, shape: torch.Size, kept: Sequence[NestedKey] = ()
-) -> Policy:
-    """The present policy of a PPO loss.
-
-    Args:
-        loss: the loss.
-        tensordict: the states, of this shape. What the collector's policy has left stays there:
-            KLPENPPOLoss reads it.
-        shape: the shape of the states.
-        kept: which of the entries that the policy writes are to be in the data.
-    """
-    data = tensordict.clone(False)
-    # TorchRL's one place for composite actions, the proximal policy and the cap of the ratio.
-    policy = Policy(*loss._log_weight(data, adv_shape=shape))
-    tensordict.update(data.select(*kept))
-    return policy
-
-
-def forward_evaluated(loss: PPOLoss, tensordict: TensorDictBase, policy: Policy) -> TensorDictBase:
-    """The loss's own forward, with a policy that has been evaluated already."""
-    return type(loss).forward(_Evaluated(loss, policy), tensordict)

@@ -13,7 +13,8 @@ from torchrl.objectives.value import GAE, ValueEstimatorBase
 from torchrl_safe.objectives._checks import check_episode_length, check_length_known
 from torchrl_safe.objectives._reduction import reduced
 from torchrl_safe.objectives.functional import per_step
-from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO, Policy
+from torchrl_safe.objectives.on_policy.constrained import ConstrainedPPO
+from torchrl_safe.objectives.on_policy.policies import Policy
 
 
 def clipped_cost_surrogate(

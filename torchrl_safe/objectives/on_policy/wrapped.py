@@ -14,7 +14,7 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_flag
 from torchrl_safe.objectives.critics.cost_critic import CostCritic, CostKeys
-from torchrl_safe.objectives.on_policy.constrained import evaluate, forward_evaluated
+from torchrl_safe.objectives.on_policy.policies import evaluate, forward_evaluated
 
 _COST_KEYS = frozenset(field.name for field in fields(CostKeys))
 # Options that a ConstrainedLoss reads and that not every loss has.
