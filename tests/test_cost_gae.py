@@ -1,6 +1,8 @@
 """CostGAE against the recursion of Schulman et al. 2015, written out in plain Python."""
 
 import re
+import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -8,8 +10,8 @@ from tensordict import TensorDict
 from torchrl.data import MultiStep
 from torchrl.objectives.value import MultiAgentGAE
 
-from torchrl_safe.objectives import CostGAE
-from torchrl_safe.testing import make_batch, make_critic
+from torchrl_safe.objectives import CostGAE, PPOLagrangianLoss
+from torchrl_safe.testing import make_batch, make_critic, make_networks
 
 GAMMA, LMBDA = 0.9, 0.7
 
@@ -304,3 +306,29 @@ def test_sums_of_several_steps_are_refused(num_costs):
     for call in (make_gae(), make_gae().value_estimate):
         with pytest.raises(ValueError, match="'steps_to_next_obs' is in the batch, which a multi"):
             call(batch)
+
+
+@pytest.fixture
+def traced():
+    """Compiles to graphs that run without code generation, so that no compiler is needed."""
+    torch.compiler.reset()
+    with warnings.catch_warnings():
+        # tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
+        warnings.filterwarnings("ignore", ".*inline_inbuilt_nn_modules", FutureWarning)
+        yield partial(torch.compile, backend="aot_eager", dynamic=False)
+
+
+def test_compiled_it_is_the_same(traced, num_costs):
+    gae = CostGAE(gamma=GAMMA, lmbda=LMBDA)
+    expected = gae(with_values(num_costs))
+    compiled = traced(gae)(with_values(num_costs))
+    for key in ("cost_advantage", "cost_value_target"):
+        torch.testing.assert_close(compiled[key], expected[key])
+
+
+@pytest.mark.integration  # Half a minute: each break of the graph is compiled by itself.
+def test_a_compiled_loss_estimates_the_same_advantages(traced):
+    loss = PPOLagrangianLoss(*make_networks(2), num_costs=2, multiplier_init=0.5)
+    expected = loss(loss.estimate_advantages(make_batch(2)))
+    losses = traced(loss)(make_batch(2))
+    torch.testing.assert_close(losses.to_dict(), expected.to_dict())

@@ -35,6 +35,14 @@ def test_a_batch_without_cost_is_refused(kind):
 
 
 @each_loss
+def test_a_termination_that_is_missing_is_named_where_keys_are_set(kind):
+    loss = make_loss(kind)
+    loss.set_keys(terminated="ended")
+    with pytest.raises(KeyError, match=r"\('next', 'ended'\)"):
+        loss(make_transitions())
+
+
+@each_loss
 def test_costs_of_the_wrong_width_are_refused(kind):
     with pytest.raises(
         ValueError, match=r"\('next', 'cost'\) must have shape \(12, 2\).*\(12, 3\)"

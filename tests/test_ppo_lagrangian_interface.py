@@ -41,6 +41,18 @@ def test_a_batch_without_cost_is_refused(call):
         getattr(loss, call)(make_batch().exclude(("next", "cost")))
 
 
+@pytest.mark.parametrize("name", ["done", "terminated"])
+def test_a_termination_that_is_missing_is_named_where_keys_are_set(name):
+    """TorchRL's estimators take done for it: the end of time would be the end of the task."""
+    loss, batch = make_loss(), make_batch()
+    batch.rename_key_(("next", name), ("next", "ended"))
+    loss.set_keys(**{name: "ended"})
+    loss.estimate_advantages(batch)
+    batch.rename_key_(("next", loss.tensor_keys.terminated), ("next", "other"))
+    with pytest.raises(KeyError, match=rf"'{loss.tensor_keys.terminated}'"):
+        loss.estimate_advantages(batch)
+
+
 @pytest.mark.parametrize("key", ["cost_value", "cost_value_target"])
 def test_what_the_cost_critic_needs_is_named_when_missing(key):
     loss = make_loss(clip_value=0.1)

@@ -157,7 +157,8 @@ def save_policy(
     actor is made of. Transforms of the environment are not part of the actor: to save a
     normalization with it, put it in front, ``TensorDictSequential(normalization.clone(), actor)``
     (without ``clone``, a transform brings its environment along). Of a
-    :class:`~torchrl.envs.VecNormV2`, put ``to_observation_norm()`` there.
+    :class:`~torchrl.envs.VecNormV2`, put ``to_observation_norm()`` there, and make it with
+    ``reduce_batch_dims=True``: by default each of several environments has its own statistics.
 
     The file is written all at once. If saving fails, the file that was there stays.
 

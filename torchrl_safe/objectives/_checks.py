@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_safe import _checks
@@ -74,6 +74,15 @@ def get_or_raise(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     if tensor is None:
         raise KeyError(f"The key {key!r} was not found in the input tensordict.")
     return tensor
+
+
+def check_terminated(tensordict: TensorDictBase, done: NestedKey, terminated: NestedKey) -> None:
+    """Raises KeyError if keys were set and ``terminated`` is missing.
+
+    TorchRL's estimators take ``done`` for it, so that every time limit would be a termination.
+    """
+    if (done, terminated) != ("done", "terminated"):
+        get_or_raise(tensordict, unravel_key(("next", terminated)))
 
 
 def refuse_options(owner: str, options: dict[str, Any], *names: str, reason: str) -> None:

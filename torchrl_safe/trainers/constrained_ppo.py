@@ -54,7 +54,8 @@ class ConstrainedPPOTrainer(PPOTrainer):
 
     Like ``PPOTrainer`` it sets the keys of the loss: pass ``reward_key``, ``done_key``,
     ``terminated_key`` and ``action_key`` here, and only the keys of the costs to
-    ``loss_module.set_keys``.
+    ``loss_module.set_keys``. Where keys are nested, pass ``episode_reward_key`` and
+    ``observation_key`` too: it logs them.
 
     A checkpoint that it writes (``checkpoint=Checkpoint(), save_trainer_file=...``) holds the state
     of the updater too, and ``load_from_file`` gives it back.

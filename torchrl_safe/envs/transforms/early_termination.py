@@ -30,6 +30,10 @@ class EarlyTermination(CostTally):
     ``del_keys=False``, or leave it out if the budget is 0. A :class:`~torchrl.envs.RewardSum`
     before this transform sums rewards without ``termination_reward``, one after it with.
 
+    An environment whose episode ends early is reset alone. Gymnasium's vectorized environments,
+    such as ``GymEnv(name, num_envs=4)``, refuse that:
+    :class:`~torchrl_safe.envs.gym.SafeGymEnv` and :class:`~torchrl.envs.SerialEnv` do not.
+
     Args:
         budget (float or Tensor): limit of the undiscounted cost of an episode, one number or one
             for each of the k costs, at least 0. The first excess of any of them ends the episode.

@@ -23,7 +23,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_count, check_kind
-from torchrl_safe.objectives._checks import check_number, get_or_raise, uncompiled
+from torchrl_safe.objectives._checks import check_number, check_terminated, get_or_raise, uncompiled
 from torchrl_safe.objectives._reduction import counted, expanded_mask, reduced, variances
 from torchrl_safe.objectives.critics.cost_gae import CostGAE
 from torchrl_safe.objectives.critics.cost_values import CostValues
@@ -158,6 +158,7 @@ class CostCritic(CostValues):
         self._check_width(cost_key, get_or_raise(tensordict, cost_key))
         for key in (keys.reward, keys.done):  # TorchRL's estimator would not name them.
             get_or_raise(tensordict, unravel_key(("next", key)))
+        check_terminated(tensordict, keys.done, keys.terminated)
         written = [unravel_key(key) for key in self.cost_critic_network.out_keys]
         if unravel_key(keys.cost_value) not in written:
             raise ValueError(

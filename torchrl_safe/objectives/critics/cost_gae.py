@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
+from torch.compiler import is_dynamo_compiling
 from torchrl.objectives.value import GAE
 
 from torchrl_safe.objectives._checks import check_number, get_or_raise, refuse_options
@@ -104,6 +105,8 @@ class CostGAE(GAE):
 
     @property
     def vectorized(self) -> bool:
+        if is_dynamo_compiling():  # As in GAE: the vectorized recursion compiles to other numbers.
+            return False
         # Asked at each call, since a loaded state may bring a discount of 0.
         return bool(super().vectorized and self.gamma * self.lmbda)
 

@@ -14,7 +14,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import GAE, ValueEstimatorBase
 
 from torchrl_safe._checks import check_count, check_kind
-from torchrl_safe.objectives._checks import get_or_raise, initial_multiplier
+from torchrl_safe.objectives._checks import check_terminated, get_or_raise, initial_multiplier
 from torchrl_safe.objectives._reduction import report_each
 from torchrl_safe.objectives.critics.cost_td0 import CostTD0
 from torchrl_safe.objectives.critics.cost_values import CostValues
@@ -198,6 +198,7 @@ class ConstrainedQLoss(CostValues):
                 f"{cost_key!r} must have shape {expected}, one column for each cost, got "
                 f"{tuple(cost.shape)}."
             )
+        check_terminated(tensordict, self.tensor_keys.done, self.tensor_keys.terminated)
         # value_loss leaves the next action in the clone; the priority belongs to the caller.
         data = tensordict.clone(False)
         losses = self.parent_forward(self, data)
