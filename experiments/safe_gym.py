@@ -26,10 +26,17 @@ from tensordict import TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Bounded, OneHot, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter
 from torchrl.envs.utils import ExplorationType
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import (
+    MLP,
+    IndependentNormal,
+    OneHotCategorical,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
 from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
 
@@ -117,7 +124,8 @@ class Config:
     random_frames: int = 1_000
     """Steps of random actions before all others, for the first statistics of observations."""
     log_std: float = -0.5
-    """Logarithm of the policy's deviation at the start, before the squashing; it is learnt."""
+    """Logarithm of the policy's deviation at the start, before the squashing; it is learnt. Has no
+    effect on discrete actions."""
     gamma: float = 0.99
     """Discount of reward and costs."""
 
@@ -259,7 +267,10 @@ class Explorer(torch.nn.Module):
 
 
 class Agent(NamedTuple):
-    """A policy and two critics, which share the statistics of observations."""
+    """A policy and two critics, which share the statistics of observations.
+
+    ``explorer`` is what collects with the policy: one of discrete actions does so itself.
+    """
 
     standardize: Standardize
     explorer: TensorDictModule
@@ -280,33 +291,44 @@ def make_agent(env: EnvBase, log_std: float) -> Agent:
     """Makes the networks for an environment."""
     observations, action = env.observation_spec_unbatched, env.action_spec_unbatched
     observation = observations.get("observation", observations)  # Some have others.
-    if observation.ndim != 1 or not isinstance(action, Bounded | Unbounded):
+    # A spec of several whole numbers is Bounded or OneHot too.
+    continuous = isinstance(action, Bounded | Unbounded) and action.domain == "continuous"
+    if observation.ndim != 1 or not (continuous or type(action) is OneHot):
         raise ValueError(
-            "env must have a vector for an observation and continuous actions, got "
-            f"{observation} and {action}."
+            "env must have a vector for an observation, and actions that are a vector or one of a "
+            f"number, got {observation} and {action}."
         )
     standardize, actions = Standardize(observation.shape[0]), action.shape[0]
     policy = torch.nn.Sequential(
-        standardize,
-        small_network(observation.shape[0], actions, gain=0.01),
-        AddStateIndependentNormalScale(actions, init_value=log_std),
+        standardize, small_network(observation.shape[0], actions, gain=0.01)
     )
-    bounds = {}
-    if isinstance(action, Bounded):
-        finite = torch.stack([action.space.low, action.space.high]).isfinite()
-        if not finite.all():
-            raise ValueError(f"env must bound its actions on both sides or on none, got {action}.")
-        bounds = {"low": action.space.low, "high": action.space.high}
-    actor = ProbabilisticActor(
-        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal if bounds else IndependentNormal,
-        distribution_kwargs={**bounds, "tanh_loc": False} if bounds else {},
-    )
+    if isinstance(action, OneHot):
+        explorer = actor = ProbabilisticActor(
+            TensorDictModule(policy, ["observation"], ["logits"]),
+            in_keys=["logits"],
+            distribution_class=OneHotCategorical,
+        )
+    else:
+        policy.append(AddStateIndependentNormalScale(actions, init_value=log_std))
+        bounds = {}
+        if isinstance(action, Bounded):
+            finite = torch.stack([action.space.low, action.space.high]).isfinite()
+            if not finite.all():
+                raise ValueError(
+                    f"env must bound its actions on both sides or on none, got {action}."
+                )
+            bounds = {"low": action.space.low, "high": action.space.high}
+        actor = ProbabilisticActor(
+            TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal if bounds else IndependentNormal,
+            distribution_kwargs={**bounds, "tanh_loc": False} if bounds else {},
+        )
+        explorer = TensorDictModule(Explorer(policy, bounds), ["observation"], ["action"])
     costs = env.reward_spec["cost"].shape[-1]
     return Agent(
         standardize,
-        TensorDictModule(Explorer(policy, bounds), ["observation"], ["action"]),
+        explorer,
         actor,
         ValueOperator(Critic(standardize, 1), ["observation"], ["state_value"]),
         ValueOperator(Critic(standardize, costs), ["observation"], ["cost_value"]),

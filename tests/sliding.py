@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
 
 STEPS = 20
 
@@ -39,12 +39,22 @@ class Slide(gymnasium.Env):
         return self.observe(), self.speed * self.reward_size, False, truncated, info
 
 
-class Silent(Slide):
-    """Has no continuous actions."""
+class SlideDiscrete(Slide):
+    """Pushes with full force, to the left, not at all, or to the right."""
 
-    action_space = Discrete(2)
+    action_space = Discrete(3)
+
+    def step(self, action):
+        return super().step(np.array([1.9 * (action - 1)]))
+
+
+class SlideGrid(Slide):
+    """Has actions of two numbers that are whole."""
+
+    action_space = MultiDiscrete([2, 3])
 
 
 gymnasium.register("Slide-v0", Slide)
 gymnasium.register("SlideScaled-v0", lambda: Slide(reward_size=128.0, cost_size=1024.0))
-gymnasium.register("Silent-v0", Silent)
+gymnasium.register("SlideDiscrete-v0", SlideDiscrete)
+gymnasium.register("SlideGrid-v0", SlideGrid)

@@ -369,9 +369,22 @@ def test_episodes_that_never_end(tmp_path):
         train(replace(SMALL, frames_per_batch=16, out=tmp_path), progress=False)
 
 
-def test_actions_that_are_not_continuous(tmp_path):
-    with pytest.raises(ValueError, match="continuous actions"):
-        train(replace(SMALL, env="sliding:Silent-v0", out=tmp_path), progress=False)
+def test_actions_that_are_several_whole_numbers(tmp_path):
+    with pytest.raises(ValueError, match="actions that are a vector or one of a number"):
+        train(replace(SMALL, env="sliding:SlideGrid-v0", out=tmp_path), progress=False)
+
+
+def test_discrete_actions_are_learnt(tmp_path):
+    """To push to the right earns more in every state, and costs."""
+    config = replace(SMALL, env="sliding:SlideDiscrete-v0", frames=2000, learning_rate=1e-2)
+    free, limited = (
+        main(replace(config, algorithm=algorithm, out=tmp_path / algorithm))
+        for algorithm in ("ppo", "ppo-lagrangian")
+    )
+    policy = load_policy(tmp_path / "ppo" / "policy.pt")
+    assert policy(np.array([1000.0, 0.0])).tolist() == [0, 0, 1]
+    name = "evaluation_with_noise"
+    assert limited[name]["cost/cost"][0] < free[name]["cost/cost"][0] / 2
 
 
 # PyTorch's compiler uses what PyTorch and TorchRL have deprecated.
