@@ -10,16 +10,18 @@ from on_policy import around, assert_same_outputs, make_loss, make_trunk, train
 from torch import nn
 from torch.distributions.transforms import SoftplusTransform
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import PopArtValueNorm, ValueOperator, recurrent_mode
+from torchrl.modules import PopArtValueNorm, QValueActor, ValueOperator, recurrent_mode
 from torchrl.objectives import (
     A2CLoss,
     ClipPPOLoss,
+    DQNLoss,
     KLPENPPOLoss,
     PPOLoss,
     ReinforceLoss,
     SACLoss,
     SoftUpdate,
 )
+from torchrl.objectives.llm import GRPOLoss
 
 from torchrl_safe.objectives import DualAscent, LagrangianLoss, PIDControl, penalized_advantage
 from torchrl_safe.testing import (
@@ -253,8 +255,12 @@ def test_what_is_no_advantage_loss_is_refused():
     with pytest.raises(ValueError, match=r"loss_module must be a LossModule, got .*Linear"):
         LagrangianLoss(torch.nn.Linear(1, 1), cost_critic)
     sac = SACLoss(actor, make_critic("state_action_value"))
-    with pytest.raises(ValueError, match=r"reads an advantage, got SACLoss"):
-        LagrangianLoss(sac, cost_critic)
+    q_actor = QValueActor(torch.nn.Linear(4, 3), in_keys=["observation"], action_space="one_hot")
+    dqn = DQNLoss(q_actor, action_space="one_hot")
+    for parent in (sac, dqn, GRPOLoss(actor)):
+        name = type(parent).__name__
+        with pytest.raises(ValueError, match=f"reads an advantage, and has a critic .* got {name}"):
+            LagrangianLoss(parent, cost_critic)
 
 
 @pytest.mark.parametrize(

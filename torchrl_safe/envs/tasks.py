@@ -126,11 +126,11 @@ class Reach:
 class Push:
     r"""Push a cube over the table to a goal.
 
-    Goals, success within 0.05 m and the cube are those of panda-gym's PandaPush (Gallouédec et
-    al. 2021, arXiv 2106.13687); success ends the episode (``terminated``). In contrast to
-    PandaPush, the cube never starts near its goal, which leaves room for an obstacle. Pushing
-    takes longer than reaching: give the environment ``max_episode_steps=60``, or 200 where the cube
-    has to go round an obstacle.
+    Success within 0.05 m and the cube are those of panda-gym's PandaPush (Gallouédec et al. 2021,
+    arXiv 2106.13687); success ends the episode (``terminated``). In contrast to PandaPush, goals
+    are the arm's own, and the cube never starts near its goal, which leaves room for an obstacle.
+    Pushing takes longer than reaching: give the environment ``max_episode_steps=60``, or 200 where
+    the cube has to go round an obstacle.
 
     The reward of a step is the progress :math:`(w - w') / \text{radius}`, where w and w' are what
     is left to do before and after it, and 10 more at success. With the object at o, the goal at g

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.objectives import A2CLoss, LossModule, PPOLoss
+from torchrl.objectives import A2CLoss, DQNLoss, LossModule, PPOLoss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_flag
@@ -180,9 +180,12 @@ def _check_wrapped(loss_module: LossModule) -> None:
         raise ValueError(
             f"loss_module must be a loss without costs, got {type(loss_module).__name__}."
         )
-    if "advantage" not in type(loss_module)._AcceptedKeys.__dataclass_fields__:
+    keys = type(loss_module)._AcceptedKeys.__dataclass_fields__
+    # DQNLoss has the keys, and no critic of states.
+    if "advantage" not in keys or "value" not in keys or isinstance(loss_module, DQNLoss):
         raise ValueError(
-            f"loss_module must be a loss that reads an advantage, got {type(loss_module).__name__}."
+            "loss_module must be a loss that reads an advantage, and has a critic to estimate it, "
+            f"got {type(loss_module).__name__}."
         )
     # Both act on the advantage that the loss is given, which is the mixture: a multiplier would
     # mean something else in each minibatch.
