@@ -293,10 +293,11 @@ def make_agent(env: EnvBase, log_std: float) -> Agent:
     observation = observations.get("observation", observations)  # Some have others.
     # A spec of several whole numbers is Bounded or OneHot too.
     continuous = isinstance(action, Bounded | Unbounded) and action.domain == "continuous"
-    if observation.ndim != 1 or not (continuous or type(action) is OneHot):
+    known = action.ndim == 1 and (continuous or type(action) is OneHot)
+    if observation.ndim != 1 or not known:
         raise ValueError(
-            "env must have a vector for an observation, and actions that are a vector or one of a "
-            f"number, got {observation} and {action}."
+            "env must have a vector for an observation, and actions that are a continuous vector "
+            f"or one of n discrete ones, got {observation} and {action}."
         )
     standardize, actions = Standardize(observation.shape[0]), action.shape[0]
     policy = torch.nn.Sequential(

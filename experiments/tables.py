@@ -1,4 +1,4 @@
-"""Tables in Markdown."""
+"""Tables in Markdown, and what fills them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Any
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Returns a table of some columns."""
-    head, *body = (f"| {' | '.join(row)} |" for row in (heads, *rows))
+    """Returns a Markdown table; each row has a cell for each head."""
+    rows = [heads, *rows]
+    assert {len(row) for row in rows} == {len(heads)}
+    head, *body = (f"|{'|'.join(f' {cell} ' if cell else ' ' for cell in row)}|" for row in rows)
     return "\n".join([head, "|---" * len(heads) + "|", *body])
 
 

@@ -54,7 +54,14 @@ class SlideGrid(Slide):
     action_space = MultiDiscrete([2, 3])
 
 
+class SlideMatrix(Slide):
+    """Has actions of two rows."""
+
+    action_space = Box(-2, 2, (2, 2), np.float32)
+
+
 gymnasium.register("Slide-v0", Slide)
 gymnasium.register("SlideScaled-v0", lambda: Slide(reward_size=128.0, cost_size=1024.0))
 gymnasium.register("SlideDiscrete-v0", SlideDiscrete)
 gymnasium.register("SlideGrid-v0", SlideGrid)
+gymnasium.register("SlideMatrix-v0", SlideMatrix)

@@ -324,6 +324,18 @@ def test_compiled_it_is_the_same(traced, num_costs):
     compiled = traced(gae)(with_values(num_costs))
     for key in ("cost_advantage", "cost_value_target"):
         torch.testing.assert_close(compiled[key], expected[key])
+    target = traced(gae.value_estimate)(with_values(num_costs))
+    torch.testing.assert_close(target, expected["cost_value_target"])
+
+
+@pytest.mark.parametrize("zero", ["gamma", "lmbda"])
+def test_the_value_estimate_with_a_discount_of_0(zero, num_costs):
+    gae = CostGAE(**{"gamma": GAMMA, "lmbda": LMBDA, zero: 0.0})
+    batch = with_values(num_costs)
+    before = batch.clone()
+    target = gae.value_estimate(batch)
+    assert (batch == before).all()
+    torch.testing.assert_close(target, gae(batch)["cost_value_target"])
 
 
 @pytest.mark.integration  # Half a minute: each break of the graph is compiled by itself.

@@ -257,7 +257,7 @@ def test_what_is_no_advantage_loss_is_refused():
     sac = SACLoss(actor, make_critic("state_action_value"))
     q_actor = QValueActor(torch.nn.Linear(4, 3), in_keys=["observation"], action_space="one_hot")
     dqn = DQNLoss(q_actor, action_space="one_hot")
-    for parent in (sac, dqn, GRPOLoss(actor)):
+    for parent in (sac, dqn, GRPOLoss(actor)):  # All but SAC have the key.
         name = type(parent).__name__
         with pytest.raises(ValueError, match=f"reads an advantage, and has a critic .* got {name}"):
             LagrangianLoss(parent, cost_critic)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from counting import Counting, Forgetful, Torque
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from torchrl.collectors import Collector
 from torchrl.data import Unbounded
@@ -251,6 +251,19 @@ def test_costs_of_skipped_frames_add_up(make_env):
 def test_as_many_frames_as_can_be(count):
     with pytest.raises(ValueError, match=f"frame_skip must be a whole number .*, got {count}"):
         SafeGymWrapper(Counting(), frame_skip=count)
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["one", "several"])
+def test_discrete_actions_are_numbered_from_0(many):
+    """TorchRL would send 0, 1 and 2."""
+
+    def make():
+        env = Counting()
+        env.action_space = Discrete(3, start=5)
+        return env
+
+    with pytest.raises(ValueError, match=r"number its actions from 0, got Discrete\(3, start=5\)"):
+        SafeGymWrapper(vector(MODES[0], make) if many else make())
 
 
 def test_frames_of_several_environments_are_not_skipped_together():

@@ -369,9 +369,10 @@ def test_episodes_that_never_end(tmp_path):
         train(replace(SMALL, frames_per_batch=16, out=tmp_path), progress=False)
 
 
-def test_actions_that_are_several_whole_numbers(tmp_path):
-    with pytest.raises(ValueError, match="actions that are a vector or one of a number"):
-        train(replace(SMALL, env="sliding:SlideGrid-v0", out=tmp_path), progress=False)
+@pytest.mark.parametrize("name", ["SlideGrid", "SlideMatrix"])
+def test_actions_that_are_neither_a_vector_nor_discrete(name, tmp_path):
+    with pytest.raises(ValueError, match="a continuous vector or one of n discrete ones"):
+        train(replace(SMALL, env=f"sliding:{name}-v0", out=tmp_path), progress=False)
 
 
 def test_discrete_actions_are_learnt(tmp_path):

@@ -81,8 +81,13 @@ def check_terminated(tensordict: TensorDictBase, done: NestedKey, terminated: Ne
 
     TorchRL's estimators take ``done`` for it, so that every time limit would be a termination.
     """
-    if (done, terminated) != ("done", "terminated"):
-        get_or_raise(tensordict, unravel_key(("next", terminated)))
+    done, terminated = unravel_key(done), unravel_key(terminated)
+    key = unravel_key(("next", terminated))
+    if (done, terminated) != ("done", "terminated") and tensordict.get(key, None) is None:
+        raise KeyError(
+            f"The key {key!r} was not found in the input tensordict. If no time limit ends its "
+            f"episodes, call set_keys(terminated={done!r})."
+        )
 
 
 def refuse_options(owner: str, options: dict[str, Any], *names: str, reason: str) -> None:

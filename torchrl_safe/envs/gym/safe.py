@@ -79,6 +79,13 @@ class _CostBesideReward(GymWrapper):
         # Which environments have reset themselves in the last step, and all their observations.
         self._started: tuple[NDArray[np.bool_], Any] | None = None
         self._vectorized = self._is_batched
+        space = getattr(env, "single_action_space", env.action_space)
+        # TorchRL's specs do not know where a Discrete space starts.
+        if isinstance(space, gymnasium.spaces.Discrete) and space.start != 0:
+            raise ValueError(
+                f"env must number its actions from 0, got {space}: wrap it in Gymnasium's "
+                "TransformAction."
+            )
         if self._vectorized and self.wrapper_frame_skip > 1:
             raise ValueError(
                 "frame_skip must be 1 for several environments, whose episodes end at different "
@@ -284,7 +291,8 @@ class SafeGymWrapper(_CostBesideReward):
 
     Raises:
         TypeError: if ``env`` is a name.
-        ValueError: if ``cost_keys`` is empty or has a key twice, or a cost is not a finite number.
+        ValueError: if ``cost_keys`` is empty or has a key twice, a cost is not a finite number, or
+            discrete actions are not numbered from 0.
         KeyError: if a step does not report a cost.
 
     Examples:

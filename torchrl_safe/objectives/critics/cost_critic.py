@@ -133,7 +133,8 @@ class CostCritic(CostValues):
             ``cost_advantage`` and ``cost_value_target`` added (and both critics' values).
 
         Raises:
-            KeyError: if the batch has no cost, reward or done.
+            KeyError: if the batch has no cost, reward or done, or, where keys were set, no
+                termination.
             ValueError: if the cost critic does not write ``cost_value``, ``num_costs`` is not
                 the width of the cost, or the batch has one dimension that is not named ``"time"``.
         """

@@ -120,6 +120,9 @@ class CostGAE(GAE):
         return super().forward(tensordict, *args, **kwargs)
 
     def value_estimate(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Tensor:
+        if not self.vectorized:  # GAE's takes the vectorized recursion whatever this says.
+            data = self.forward(tensordict.clone(False), *args, **kwargs)
+            return data.get(self.tensor_keys.value_target)
         self._check(tensordict)
         return super().value_estimate(tensordict, *args, **kwargs)
 

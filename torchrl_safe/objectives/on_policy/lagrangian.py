@@ -53,7 +53,7 @@ class LagrangianLoss(ConstrainedLoss, WrappedLoss):
 
     Raises:
         TypeError: if ``separate_losses`` or ``normalize_cost_advantage`` is not a bool.
-        ValueError: if ``loss_module`` reads no advantage or normalizes the one it is given, or
+        ValueError: if ``loss_module`` reads no advantage, normalizes it or has no critic, or
             ``num_costs`` or ``multiplier_init`` is not usable; in a call, if the cost critic or
             the costs have another width than ``num_costs``.
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.objectives import A2CLoss, DQNLoss, LossModule, PPOLoss
+from torchrl.objectives import A2CLoss, LossModule, PPOLoss
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_safe._checks import check_flag
@@ -181,8 +181,8 @@ def _check_wrapped(loss_module: LossModule) -> None:
             f"loss_module must be a loss without costs, got {type(loss_module).__name__}."
         )
     keys = type(loss_module)._AcceptedKeys.__dataclass_fields__
-    # DQNLoss has the keys, and no critic of states.
-    if "advantage" not in keys or "value" not in keys or isinstance(loss_module, DQNLoss):
+    # GRPOLoss has the key, and no critic; a loss of yours need not be a subclass of those that do.
+    if "advantage" not in keys or not hasattr(loss_module, "critic_network"):
         raise ValueError(
             "loss_module must be a loss that reads an advantage, and has a critic to estimate it, "
             f"got {type(loss_module).__name__}."
