@@ -184,7 +184,7 @@ def test_tables_show_what_is_left_without_the_shield():
     run = {"evaluation": evaluation, "without_shield": without}
     limits = {"collision": 0.5, "correction": 0.2}
     lines = table({"algorithms": {"ppo-shield": run}, "cost_limits": limits}).splitlines()
-    assert lines[3] == "| ppo-shield, without its shield | 3.00 [2.00, 4.00] |  |"
+    assert lines[3] == "| ppo-shield, without its shield | 3.00 [2.00, 4.00] | |"
 
 
 def test_costs_are_summed_over_training():

@@ -229,7 +229,7 @@ def test_table_and_folder(tmp_path, capsys):
     _, limits, as_trained, heavy = lines[head + 1 : head + 5]
     assert limits == f"| limits | collision 0.5, separation {LIMIT:g} | |"
     assert as_trained.startswith("| as trained | ")
-    assert heavy == "| heavy object |  | 0/0 |"
+    assert heavy == "| heavy object | | 0/0 |"
 
 
 def test_a_shield_that_was_trained_with_is_there(tmp_path, monkeypatch):
