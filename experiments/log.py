@@ -15,6 +15,9 @@ from tensordict import TensorDictBase
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import get_logger
 
+# What a run uses.
+_PACKAGES = ("torch", "torchrl", "pybullet", "mujoco", "gymnasium", "safety-gymnasium")
+
 
 class Log:
     """A TorchRL logger for runs that can be resumed.
@@ -132,11 +135,7 @@ def score(rows: Sequence[dict[str, float]], limits: Mapping[str, float]) -> floa
     return fmean(row["return"] for row in ended)
 
 
-def versions(
-    packages: Sequence[str] = (
-        "torch", "torchrl", "pybullet", "mujoco", "gymnasium", "safety-gymnasium",
-    ),
-) -> dict[str, str]:  # fmt: skip
+def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str]:
     """What the figures of a run depend on beside its settings: versions of what is installed."""
     found = {}
     for name in packages:

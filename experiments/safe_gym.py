@@ -26,7 +26,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, OneHot, Unbounded
+from torchrl.data import Bounded, OneHot, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import (
@@ -299,41 +299,44 @@ def make_agent(env: EnvBase, log_std: float) -> Agent:
             "env must have a vector for an observation, and actions that are a continuous vector "
             f"or one of n discrete ones, got {observation} and {action}."
         )
-    standardize, actions = Standardize(observation.shape[0]), action.shape[0]
-    policy = torch.nn.Sequential(
-        standardize, small_network(observation.shape[0], actions, gain=0.01)
+    standardize = Standardize(observation.shape[0])
+    costs = env.reward_spec["cost"].shape[-1]
+    return Agent(
+        standardize,
+        *make_policy(standardize, action, log_std),
+        ValueOperator(Critic(standardize, 1), ["observation"], ["state_value"]),
+        ValueOperator(Critic(standardize, costs), ["observation"], ["cost_value"]),
     )
+
+
+def make_policy(
+    standardize: Standardize, action: TensorSpec, log_std: float
+) -> tuple[TensorDictModule, ProbabilisticActor]:
+    """Makes what explores, and the policy."""
+    net = small_network(len(standardize.mean), action.shape[0], gain=0.01)
     if isinstance(action, OneHot):
-        explorer = actor = ProbabilisticActor(
+        policy = torch.nn.Sequential(standardize, net)
+        actor = ProbabilisticActor(
             TensorDictModule(policy, ["observation"], ["logits"]),
             in_keys=["logits"],
             distribution_class=OneHotCategorical,
         )
-    else:
-        policy.append(AddStateIndependentNormalScale(actions, init_value=log_std))
-        bounds = {}
-        if isinstance(action, Bounded):
-            finite = torch.stack([action.space.low, action.space.high]).isfinite()
-            if not finite.all():
-                raise ValueError(
-                    f"env must bound its actions on both sides or on none, got {action}."
-                )
-            bounds = {"low": action.space.low, "high": action.space.high}
-        actor = ProbabilisticActor(
-            TensorDictModule(policy, ["observation"], ["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal if bounds else IndependentNormal,
-            distribution_kwargs={**bounds, "tanh_loc": False} if bounds else {},
-        )
-        explorer = TensorDictModule(Explorer(policy, bounds), ["observation"], ["action"])
-    costs = env.reward_spec["cost"].shape[-1]
-    return Agent(
-        standardize,
-        explorer,
-        actor,
-        ValueOperator(Critic(standardize, 1), ["observation"], ["state_value"]),
-        ValueOperator(Critic(standardize, costs), ["observation"], ["cost_value"]),
+        return actor, actor
+    bounds = {}
+    if isinstance(action, Bounded):
+        finite = torch.stack([action.space.low, action.space.high]).isfinite()
+        if not finite.all():
+            raise ValueError(f"env must bound its actions on both sides or on none, got {action}.")
+        bounds = {"low": action.space.low, "high": action.space.high}
+    noise = AddStateIndependentNormalScale(action.shape[0], init_value=log_std)
+    policy = torch.nn.Sequential(standardize, net, noise)
+    actor = ProbabilisticActor(
+        TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal if bounds else IndependentNormal,
+        distribution_kwargs={**bounds, "tanh_loc": False} if bounds else {},
     )
+    return TensorDictModule(Explorer(policy, bounds), ["observation"], ["action"]), actor
 
 
 def make_env(config: Config) -> EnvBase:

@@ -1,8 +1,6 @@
 """CostGAE against the recursion of Schulman et al. 2015, written out in plain Python."""
 
 import re
-import warnings
-from functools import partial
 
 import pytest
 import torch
@@ -308,17 +306,20 @@ def test_sums_of_several_steps_are_refused(num_costs):
             call(batch)
 
 
-@pytest.fixture
-def traced():
-    """Compiles to graphs that run without code generation, so that no compiler is needed."""
+def traced(function):
+    """The function as graphs that run without code generation, so that no compiler is needed."""
     torch.compiler.reset()
-    with warnings.catch_warnings():
-        # tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
-        warnings.filterwarnings("ignore", ".*inline_inbuilt_nn_modules", FutureWarning)
-        yield partial(torch.compile, backend="aot_eager", dynamic=False)
+    return torch.compile(function, backend="aot_eager", dynamic=False)
 
 
-def test_compiled_it_is_the_same(traced, num_costs):
+# tensordict 0.14 reads a dynamo option that torch 2.13 deprecates.
+warns = pytest.mark.filterwarnings(
+    "ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning"
+)
+
+
+@warns
+def test_compiled_it_is_the_same(num_costs):
     gae = CostGAE(gamma=GAMMA, lmbda=LMBDA)
     expected = gae(with_values(num_costs))
     compiled = traced(gae)(with_values(num_costs))
@@ -338,8 +339,9 @@ def test_the_value_estimate_with_a_discount_of_0(zero, num_costs):
     torch.testing.assert_close(target, gae(batch)["cost_value_target"])
 
 
+@warns
 @pytest.mark.integration  # Half a minute: each break of the graph is compiled by itself.
-def test_a_compiled_loss_estimates_the_same_advantages(traced):
+def test_a_compiled_loss_estimates_the_same_advantages():
     loss = PPOLagrangianLoss(*make_networks(2), num_costs=2, multiplier_init=0.5)
     expected = loss(loss.estimate_advantages(make_batch(2)))
     losses = traced(loss)(make_batch(2))

@@ -79,7 +79,8 @@ class _CostBesideReward(GymWrapper):
         # Which environments have reset themselves in the last step, and all their observations.
         self._started: tuple[NDArray[np.bool_], Any] | None = None
         self._vectorized = self._is_batched
-        space = getattr(env, "single_action_space", env.action_space)
+        raw = self._env
+        space = raw.single_action_space if self._vectorized else raw.action_space
         # TorchRL's specs do not know where a Discrete space starts.
         if isinstance(space, gymnasium.spaces.Discrete) and space.start != 0:
             raise ValueError(
