@@ -177,7 +177,7 @@ def main():
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--layouts", nargs="+", choices={**FIXED, **MOVING}, default=list(FIXED))
     parser.add_argument("--obstacle-speed", type=float, help="that the shield expects, m/s")
-    parser.add_argument("--tool-weight", type=float, default=0.0, help="of the shield, rad/m")
+    parser.add_argument("--tool-weight", type=float, default=10.0, help="of the shield, rad/m")
     parser.add_argument("--out", type=Path, default=Path("runs/attack.json"), help="what is done")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -31,13 +31,10 @@ def with_bounds(rows, least, lower, upper):
 def problems(seed, count=40, unknowns=3, rows=5):
     """Some with a solution and some without."""
     rng = np.random.default_rng(seed)
-    return (
-        2 * rng.normal(size=(count, unknowns)),
-        rng.normal(size=(count, rows, unknowns)),
-        0.5 * rng.normal(size=(count, rows)),
-        -rng.uniform(0, 1, (count, unknowns)),
-        rng.uniform(0, 1, (count, unknowns)),
-    )
+    wanted = 2 * rng.normal(size=(count, unknowns))
+    given = rng.normal(size=(count, rows, unknowns)), 0.5 * rng.normal(size=(count, rows))
+    bounds = -rng.uniform(0, 1, (count, unknowns)), rng.uniform(0, 1, (count, unknowns))
+    return np.clip(wanted, *bounds), *given, *bounds
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -52,15 +49,15 @@ def test_projections_are_the_nearest_points(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_projections_also_count_how_an_image_changes(seed):
+def test_projections_also_count_what_happens_along_a_vector(seed):
     """In the coordinates of the symmetric square root the distance is the Euclidean one."""
-    image = np.random.default_rng(seed).normal(size=(40, 2, 3))
-    points, solved = project(*problems(seed), image)
+    along = np.random.default_rng(seed).normal(size=(40, 3))
+    points, solved = project(*problems(seed), along)
     np.testing.assert_array_equal(solved, project(*problems(seed))[1])
     for index in np.flatnonzero(solved):
         wanted, *inequalities = (part[index] for part in problems(seed))
         all_rows, bounds = with_bounds(*inequalities)
-        values, vectors = np.linalg.eigh(np.eye(3) + image[index].T @ image[index])
+        values, vectors = np.linalg.eigh(np.eye(3) + np.outer(along[index], along[index]))
         root = vectors * np.sqrt(values) @ vectors.T
         expected = brute_force(root @ wanted, all_rows @ np.linalg.inv(root), bounds)
         np.testing.assert_allclose(root @ points[index], expected, atol=1e-7)
@@ -115,9 +112,9 @@ def test_equations_without_a_solution_do_not_end_the_others():
     np.testing.assert_array_equal(shares[1], [0.5, 0.5])
 
 
-@pytest.mark.parametrize("images", [(), (np.random.default_rng(0).normal(size=(40, 3, 7)),)])
-def test_projections_do_not_depend_on_each_other(images):
-    arguments = (*problems(1, unknowns=7, rows=12), *images)
+@pytest.mark.parametrize("along", [(), (np.random.default_rng(0).normal(size=(40, 7)),)])
+def test_projections_do_not_depend_on_each_other(along):
+    arguments = (*problems(1, unknowns=7, rows=12), *along)
     points, solved = project(*arguments)
     for index in range(len(points)):
         alone, solves = project(*(part[index : index + 1] for part in arguments))

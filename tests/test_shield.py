@@ -192,16 +192,18 @@ def test_the_tool_goes_on_where_other_joints_can_give_way(make_env, engine):
     env.reset()
     state, simulator = env.arm_state, env._simulator
     action = np.sign(state.obstacle_position[:, 0] - state.ee_position)
-    asked, fingers = CartesianDelta().targets(action, state, simulator)
+    asked, fingers = CartesianDelta(step=0.02).targets(action, state, simulator)
+    jacobian = simulator.jacobian(state.joint_position)[:, :3]
+    way = (jacobian @ (asked - state.joint_position)[:, :, None])[:, :, 0]
     speeds = {"longest": simulator.joint_speed / env.control_rate, "duration": 1 / env.control_rate}
     missed, turned = [], []
     for tool_weight in (0.0, 10.0):
-        shield = Shield(tool_weight=tool_weight)
+        shield = Shield(rate=1.0, acceleration=1e3, tool_weight=tool_weight)
         done = shield(asked, fingers, state, simulator, **speeds)
         assert not done.braked.any()
         change = done.joints - asked
-        tool = simulator.jacobian(state.joint_position)[:, :3] @ change[:, :, None]
-        missed.append(np.linalg.norm(tool[:, :, 0], axis=1))
+        tool = (jacobian @ change[:, :, None])[:, :, 0]
+        missed.append(np.abs((tool * way).sum(axis=1)))
         turned.append(np.linalg.norm(change, axis=1))
     assert (missed[1] < missed[0]).all()
     assert (turned[1] > turned[0]).all()
@@ -410,7 +412,7 @@ def test_what_the_fingers_use_up_counts_when_it_looks_ahead():
     world = _Fist()
     joint = dict.fromkeys(("joint_position", "joint_velocity", "finger_position"), np.zeros((2, 1)))
     state = make_state(**joint, joint_lower=[-9.0], joint_upper=[9.0])
-    shield = Shield(margin=0.0, table=0.0, acceleration=1e4)
+    shield = Shield(margin=0.0, table=0.0, acceleration=1e4, tool_weight=0.0)
     asked = np.full((2, 1), 0.2), np.full((2, 1), 0.0315)
     done = shield(*asked, state, world, longest=np.array([0.2]), duration=0.05)
     assert len(world.measured) == 2

@@ -38,7 +38,7 @@ def shielded(world, asked=0.2, fingers=0.0, state=None, **settings):
         "joint_upper": np.array([9.0]),
         **(state or {}),
     }
-    shield = Shield(**{"acceleration": 1e4, **settings})
+    shield = Shield(**{"acceleration": 1e4, "tool_weight": 0, **settings})
     return shield(
         one + asked,
         held + fingers,
@@ -106,24 +106,41 @@ def test_each_shape_may_use_up_what_its_nearest_pair_may():
 
 
 class Corner:
-    """Two joints take as much off a distance; the first moves the tool along x."""
+    """Two joints take as much off a distance; the first moves the tool along x, 1 m/rad."""
+
+    fingers = 0
+
+    def __init__(self, distance):
+        self.distance = distance
 
     def nearest(self, rows, angles, fingers):
         ones = np.ones((len(rows), 1, 3))
-        distance = 0.005 - angles.sum(axis=1, keepdims=True)
+        distance = self.distance - angles.sum(axis=1, keepdims=True)
         return Nearest(distance, ones * (0, 1, 0), ones, -ones[..., :2], np.array([0]))
 
     def jacobian(self, angles):
         return np.eye(6, 2) * (1, 0) + np.zeros((len(angles), 1, 1))
 
 
-def test_a_pressed_arm_takes_the_shortest_way_out():
-    """Whatever its tool weighs."""
+def cornered(distance, asked, **settings):
     zero, limits = np.zeros((2, 2)), np.full(2, 9.0)
     joints = dict.fromkeys(("joint_position", "joint_velocity"), zero)
     state = make_state(**joints, joint_lower=-limits, joint_upper=limits)
-    shield = Shield(tool_weight=10.0, acceleration=1e4)
-    done = shield(zero, zero[:, :0], state, Corner(), longest=np.full(2, 0.2), duration=0.05)
+    shield = Shield(acceleration=1e4, **settings)
+    longest = np.full(2, 0.2)
+    world = Corner(distance)
+    return shield(zero + asked, zero[:, :0], state, world, longest=longest, duration=0.05)
+
+
+def test_joints_that_move_the_tool_where_it_is_to_go_give_way_less():
+    """With the weight k the first gives way 1 / (1 + k^2) times as much as the second."""
+    done = cornered(0.05, (0.1, 0.15), margin=0, table=0, rate=1e3, tool_weight=3.0)
+    np.testing.assert_allclose(done.joints, [[0.1 - 0.2 / 11, 0.15 - 0.2 * 10 / 11]] * 2)
+
+
+def test_a_pressed_arm_takes_the_shortest_way_out():
+    """Whatever its tool weighs."""
+    done = cornered(0.005, 0.0, tool_weight=10.0)
     assert done.braked.all()
     np.testing.assert_allclose(done.joints, -SHARE * 0.015 / 2)
 

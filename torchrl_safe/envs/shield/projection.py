@@ -27,57 +27,54 @@ def project(
     least: Array,
     lower: Array,
     upper: Array,
-    image: Array | None = None,
+    along: Array | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
     r"""Returns the points nearest to ``wanted`` at which linear inequalities hold.
 
     .. math::
-        \min_x \tfrac12 |x - w|^2 + \tfrac12 |K (x - w)|^2
+        \min_x \tfrac12 |x - w|^2 + \tfrac12 (k^\top (x - w))^2
         \quad \text{such that} \quad A x \ge b, \quad l \le x \le u
 
     Solved exactly, by the dual active-set method of Goldfarb and Idnani (1983, Mathematical
-    Programming 27). It begins with the bounds, which need no search. Then, as long as an inequality
-    is violated, it moves onto the most violated one while those that are already active stay so,
-    and drops those that no longer push. It ends after finitely many steps, and knows when there is
-    no solution. Most problems take none or one, and all N take their steps together. The result
-    of a problem does not depend on the others.
+    Programming 27). As long as an inequality is violated, it moves onto the most violated one while
+    those that are already active stay so, and drops those that no longer push. It ends after
+    finitely many steps, and knows when there is no solution. Most problems take none or one, and
+    all N take their steps together. The result of a problem does not depend on the others.
 
     Args:
-        wanted: w, ``(N, n)``.
+        wanted: w, ``(N, n)``, within the bounds.
         rows: A, ``(N, r, n)``.
         least: b, ``(N, r)``; -inf for rows that do not count.
         lower: l, ``(N, n)``; may be infinite.
         upper: u, ``(N, n)``, not less than l; may be infinite.
-        image: K, ``(N, m, n)``; without it, only :math:`|x - w|` counts.
+        along: k, ``(N, n)``; without it, only :math:`|x - w|` counts.
 
     Returns:
         The points, ``(N, n)``, and which problems have a solution, ``(N,)``. Where there is
         none, the point has no meaning.
 
     Examples:
-        >>> wanted, bound = np.array([[-1.0, 2.0]]), np.full((1, 2), 1.5)
+        >>> wanted, bound = np.array([[-1.0, 1.0]]), np.full((1, 2), 1.5)
         >>> project(wanted, np.array([[[1.0, 0.0]]]), np.zeros((1, 1)), -bound, bound)
-        (array([[0. , 1.5]]), array([ True]))
+        (array([[0., 1.]]), array([ True]))
     """
-    point = np.clip(wanted, lower, upper)
+    point = wanted.copy()
     solved = np.asarray(((rows @ point[:, :, None])[:, :, 0] >= least - _TOLERANCE).all(axis=1))
-    if image is not None:  # The nearest of a box is then another point.
-        solved &= (point == wanted).all(axis=1)
     open_ = np.flatnonzero(~solved)
     if not len(open_):
         return point, solved
-    rows, least, bounds = rows[open_], least[open_], (lower[open_], upper[open_])
-    if image is None:
-        rows, least = _with_bounds(*_unit(rows, least), *bounds)
-        point[open_], solved[open_] = _active_set(wanted[open_], point[open_], rows, least)
+    target = wanted[open_]
+    rows, least = _with_bounds(rows[open_], least[open_], lower[open_], upper[open_])
+    if along is None:
+        point[open_], solved[open_] = _active_set(target, *_unit(rows, least))
         return point, solved
-    # With L L^T = 1 + K^T K, the distance between y = L^T x is the one that counts.
-    some = image[open_]
-    root = np.linalg.cholesky(np.eye(wanted.shape[1]) + some.transpose(0, 2, 1) @ some)
-    back = np.linalg.inv(root).transpose(0, 2, 1)
-    target = (root.transpose(0, 2, 1) @ wanted[open_, :, None])[:, :, 0]
-    rows, least = _with_bounds(rows, least, *bounds)
-    found, solved[open_] = _active_set(target, target, *_unit(rows @ back, least))
+    # With y = (1 + k k^T)^(1/2) x, the distance between y is the one that counts.
+    outer = along[open_, :, None] * along[open_, None]
+    length = np.sqrt(1 + np.einsum("kii->k", outer))[:, None, None]
+    root = np.eye(wanted.shape[1]) + outer / (1 + length)
+    back = np.eye(wanted.shape[1]) - outer / (length + length**2)
+    target = (root @ target[:, :, None])[:, :, 0]
+    found, solved[open_] = _active_set(target, *_unit(rows @ back, least))
     point[open_] = (back @ found[:, :, None])[:, :, 0]
     return point, solved
 
@@ -99,23 +96,15 @@ def _unit(rows: Array, least: Array) -> tuple[Array, Array]:
     return np.where(flat[..., None], 0.0, rows * scale[..., None]), least * scale
 
 
-def _active_set(
-    wanted: Array, point: Array, rows: Array, least: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Adds one constraint after the other, to begin with the bounds at which ``point`` is."""
+def _active_set(point: Array, rows: Array, least: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Adds one constraint after the other."""
     count, width = point.shape
-    each, joint = np.arange(count), np.arange(width)
-    # Up to n active constraints of each problem: their rows, multipliers and numbers. A bound that
-    # is active at the beginning is in the slot of its unknown.
-    push = point - wanted
-    normals = np.sign(push)[:, :, None] * np.eye(width)
-    multipliers = np.abs(push)
-    active = rows.shape[1] - np.where(push > 0, 2, 1) * width + joint
-    active[push == 0] = -1
+    each = np.arange(count)
+    # Up to n active constraints of each problem: their rows, multipliers and numbers.
+    normals, multipliers = np.zeros((count, width, width)), np.zeros((count, width))
+    active = np.full((count, width), -1)
     # Those that are active are not looked at until they are dropped.
     watched = least.copy()
-    index, slot = (active >= 0).nonzero()
-    watched[index, active[index, slot]] = -np.inf
     # The constraint that is being added, and its multiplier so far.
     entering, weight = np.full(count, -1), np.zeros(count)
     never = np.full((count, width), np.inf)

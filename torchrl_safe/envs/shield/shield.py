@@ -79,7 +79,7 @@ class Shield:
     are nearest to those asked for, :math:`q + w`:
 
     .. math::
-        \min_x |x - w|^2 + \kappa^2 |J (x - w)|^2 \quad\text{such that}\quad
+        \min_x |x - w|^2 + (\kappa\, t^\top J (x - w))^2 \quad\text{such that}\quad
         \nabla d_i^\top x - c_i \ge -s(r_i) \quad\text{for all } i, \qquad l \le x \le u
 
     J is the Jacobian of the tool point and :math:`\kappa` is ``tool_weight``. If it is not 0, the
@@ -170,7 +170,7 @@ class Shield:
     acceleration: float = 10.0
     obstacle_speed: float | None = None
     workspace: Region | None = None
-    tool_weight: float = 0.0
+    tool_weight: float = 10.0
 
     def __post_init__(self) -> None:
         check_not_negative(margin=self.margin, table=self.table, tool_weight=self.tool_weight)
@@ -216,19 +216,16 @@ class Shield:
         near = self._measure(step, np.arange(len(angles)), angles, held)
         pressed = self._is_pressed(state, near)
         now = self._with_tool(step, near, pressed)
-        asked = np.where(pressed[:, None], 0.0, joints - angles)
         lower, upper = self._bounds(step, now, longest)
+        asked = np.clip(np.where(pressed[:, None], 0.0, joints - angles), lower, upper)
         by_fingers = (now.fingers @ opening[:, :, None])[:, :, 0]
         least = self._least(step, now) - by_fingers
         least = _attainable(now.joints, least, lower, upper)
         # If nothing leaves enough room to stop, take what stops above the margin.
         last = np.minimum(least, now.closing - now.room)
         comes = now.closing > 0
-        tool = None
-        if self.tool_weight:
-            tool = self.tool_weight * simulator.jacobian(angles)[:, :3]
-            tool[pressed] = 0  # The shortest way out.
-        change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper, tool)
+        along = self._along(step, asked) if self.tool_weight else None
+        change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper, along)
         # Measure the end of the step as well where it could be too near.
         left = near.room - near.closing + (near.joints @ change[:, :, None])[:, :, 0]
         left += by_fingers[:, : left.shape[1]]  # Not the rows of the tool point.
@@ -254,7 +251,7 @@ class Shield:
                 np.concatenate([comes[again], then.closing[short] > 0], axis=1),
                 lower[again],
                 upper[again],
-                None if tool is None else tool[again],
+                None if along is None else along[again],
             )
         still, braked = ~solved[:, None], braked | pressed
         if fingers.shape[1]:
@@ -339,6 +336,14 @@ class Shield:
             np.clip(turning + slack, lower, np.minimum(upper, _FAR)),
         )
 
+    def _along(self, step: _Step, asked: Array) -> Array:
+        """How far joints move the tool the way that is asked for, times its weight, ``(N, n)``."""
+        linear = step.simulator.jacobian(step.state.joint_position)[:, :3]
+        way = (linear @ asked[:, :, None])[:, :, 0]
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        way = np.divide(way, length, out=np.zeros_like(way), where=length > _TOLERANCE)
+        return self.tool_weight * (way[:, None] @ linear)[:, 0]
+
     def _with_tool(self, step: _Step, near: _Pairs, pressed: NDArray[np.bool_]) -> _Pairs:
         """Adds what holds for the tool point.
 
@@ -409,7 +414,7 @@ def _solve(
     comes: NDArray[np.bool_],
     lower: Array,
     upper: Array,
-    tool: Array | None,
+    along: Array | None,
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Projects; where there is no solution, to a stand, with ``last`` in place of ``least``.
 
@@ -419,11 +424,11 @@ def _solve(
     Returns:
         The solutions, where there is one, and which are not of what was asked for.
     """
-    change, solved = project(asked, rows, least, lower, upper, tool)
+    change, solved = project(asked, rows, least, lower, upper, along)
     braked = ~solved
     some = np.flatnonzero(braked)
     if len(some):
-        still = np.zeros_like(asked[some])
+        still = np.clip(0.0, lower[some], upper[some])
         change[some], solved[some] = project(
             still, rows[some], last[some], lower[some], upper[some]
         )
