@@ -177,7 +177,6 @@ def main():
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--layouts", nargs="+", choices={**FIXED, **MOVING}, default=list(FIXED))
     parser.add_argument("--obstacle-speed", type=float, help="that the shield expects, m/s")
-    parser.add_argument("--tool-weight", type=float, default=10.0, help="of the shield, rad/m")
     parser.add_argument("--out", type=Path, default=Path("runs/attack.json"), help="what is done")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -186,7 +185,7 @@ def main():
     each = -(-options.steps // (len(cases) * options.envs))
     done = json.loads(options.out.read_text()) if options.out.exists() else {}
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    shield = Shield(obstacle_speed=options.obstacle_speed, tool_weight=options.tool_weight)
+    shield = Shield(obstacle_speed=options.obstacle_speed)
     names = [
         f"{options.physics} {arm} {action} {layout} {attack}, {each} x {options.envs}, {shield}"
         for arm, action, layout, attack in cases

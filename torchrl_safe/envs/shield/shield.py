@@ -82,11 +82,12 @@ class Shield:
         \min_x |x - w|^2 + (\kappa\, t^\top J (x - w))^2 \quad\text{such that}\quad
         \nabla d_i^\top x - c_i \ge -s(r_i) \quad\text{for all } i, \qquad l \le x \le u
 
-    J is the Jacobian of the tool point and :math:`\kappa` is ``tool_weight``. If it is not 0, the
-    joints that can give way without moving the tool do so: a hand turns to pass an obstacle. T is
-    the duration of the control step, c how far the obstacle comes nearer in it, and s a control
-    barrier function in discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and Sreenath
-    2017, RSS), with which the arm can always stop:
+    J is the Jacobian of the tool point, the unit vector t is where w would move it, and
+    :math:`\kappa` is ``tool_weight``. Joints that can give way without slowing the tool down give
+    way first: a hand turns to pass an obstacle. The tool may move aside. T is the duration of the
+    control step, c how far the obstacle comes nearer in it, and s a control barrier function in
+    discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and Sreenath 2017, RSS), with which
+    the arm can always stop:
 
     .. math::
         s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\ \sqrt{b^2 / 4 + 2 b r} - b / 2\right),
@@ -98,8 +99,9 @@ class Shield:
     arm move away.
 
     The bounds l and u keep joint targets within limits and speeds, and within what motors can
-    follow. A joint's velocity changes by no more than ``acceleration`` allows, or by what takes up
-    the remaining room, whichever is more. Far from everything the shield therefore changes nothing.
+    follow. What is asked for is clipped to them first. A joint's velocity changes by no more than
+    ``acceleration`` allows, or by what takes up the remaining room, whichever is more. Far from
+    everything the shield therefore changes nothing.
 
     The problem treats distances as linear, which is not exact. Where the end of the step could be
     too near, the shield measures the distances there as well and solves a second problem with them.
@@ -146,8 +148,8 @@ class Shield:
         workspace: if given, the tool point stays in this box, the margin away from its walls. If
             it begins outside, it moves in. Where there is no solution, a fast tool may leave it by
             a centimetre while the arm brakes.
-        tool_weight: how much a metre of the tool point's way counts against a radian of a joint's,
-            rad/m. With 0, only joints count.
+        tool_weight: how much a metre that the tool point falls short counts against a radian that
+            a joint does, rad/m. With 0, only joints count.
 
     Raises:
         TypeError: if ``workspace`` is not a Region.
