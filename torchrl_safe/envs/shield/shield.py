@@ -22,7 +22,7 @@ _ERROR = 0.1
 _SHORTEST, _FAR = 1e-3, 1e3
 # Below this, a distance counts as 0, m.
 _TOLERANCE = 1e-9
-# What a moving obstacle comes too near counts as much as this turn of a joint, m/rad.
+# What an arm that brakes comes too near counts as much as this turn of a joint, m/rad.
 _GIVES = 1e-3
 # The share of the joints' braking that a distance counts on: some joints may have to keep turning.
 _SURE = 1 / 3
@@ -418,10 +418,11 @@ def _solve(
     upper: Array,
     along: Array | None,
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Projects; where there is no solution, to a stand, with ``last`` in place of ``least``.
+    """Projects; where there is no solution, brakes.
 
-    Where there is none either, what ``comes`` may come nearer, as little as possible. The joints
-    may then brake as hard as they can.
+    Braking means the slowest motion that misses ``least`` as little as possible, and ``last`` not
+    at all. Where there is none either, what ``comes`` may come nearer, as little as possible. The
+    joints may then brake as hard as they can.
 
     Returns:
         The solutions, where there is one, and which are not of what was asked for.
@@ -430,20 +431,37 @@ def _solve(
     braked = ~solved
     some = np.flatnonzero(braked)
     if len(some):
-        still = np.clip(0.0, lower[some], upper[some])
-        change[some], solved[some] = project(
-            still, rows[some], last[some], lower[some], upper[some]
+        change[some], solved[some] = _slowest(
+            np.concatenate([rows[some]] * 2, axis=1),
+            np.concatenate([least[some], last[some]], axis=1),
+            np.arange(2 * rows.shape[1]) < rows.shape[1],
+            lower[some],
+            upper[some],
         )
     some = np.flatnonzero(~solved & comes.any(axis=1))
     if len(some):
-        # One more unknown: by how much what comes is too near, in units of _GIVES.
-        none = np.zeros((len(some), 1))
-        point, solved[some] = project(
-            np.zeros((len(some), asked.shape[1] + 1)),
-            np.concatenate([rows[some], _GIVES * comes[some, :, None]], axis=2),
+        change[some], solved[some] = _slowest(
+            rows[some],
             last[some],
-            np.concatenate([np.minimum(lower[some], 0), none], axis=1),
-            np.concatenate([np.maximum(upper[some], 0), none + np.inf], axis=1),
+            comes[some],
+            np.minimum(lower[some], 0),
+            np.maximum(upper[some], 0),
         )
-        change[some] = point[:, :-1]
     return change, solved, braked
+
+
+def _slowest(
+    rows: Array, least: Array, gives: NDArray[np.bool_], lower: Array, upper: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """The slowest motion; that rows which give miss what they ask for counts much more."""
+    # One more unknown: by how much, in units of _GIVES.
+    none = np.zeros((len(rows), 1))
+    missed = np.broadcast_to(_GIVES * gives, least.shape)
+    point, solved = project(
+        np.concatenate([np.clip(0.0, lower, upper), none], axis=1),
+        np.concatenate([rows, missed[:, :, None]], axis=2),
+        least,
+        np.concatenate([lower, none], axis=1),
+        np.concatenate([upper, none + np.inf], axis=1),
+    )
+    return point[:, :-1], solved
