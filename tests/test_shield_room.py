@@ -5,7 +5,7 @@ import pytest
 from states import make_state
 
 from torchrl_safe.envs import Nearest, Shield
-from torchrl_safe.envs.shield.shield import _needed, _Pairs
+from torchrl_safe.envs.shield.shield import _needed, _Pairs, _solve
 
 # Share of the room above the margin, 20 / s over 1/20 s.
 SHARE = 1 - np.exp(-1)
@@ -143,6 +143,19 @@ def test_a_pressed_arm_takes_the_shortest_way_out():
     done = cornered(0.005, 0.0, tool_weight=10.0)
     assert done.braked.all()
     np.testing.assert_allclose(done.joints, -SHARE * 0.015 / 2)
+
+
+def test_an_arm_that_brakes_misses_what_it_needs_as_little_as_possible():
+    """One row asks for at least 0.02 rad, the other for at most -0.01: it is as far from both."""
+    rows, least = np.array([[[1.0], [-1.0]]]), np.array([[0.02, 0.01]])
+    bounds, comes = np.array([[1.0]]), np.zeros((1, 2), dtype=bool)
+    for last, expected in ((-1.0, 0.005), (-0.002, 0.002)):
+        change, solved, braked = _solve(
+            np.array([[0.5]]), rows, least, np.full((1, 2), last), comes, -bounds, bounds, None
+        )
+        assert solved.all()
+        assert braked.all()
+        np.testing.assert_allclose(change, [[expected]], atol=1e-6)
 
 
 class Bend:

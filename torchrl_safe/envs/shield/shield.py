@@ -108,10 +108,10 @@ class Shield:
     In it, one more step like this one, slower by b, has to be safe too.
 
     If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
-    motion that does not use up more than all the room. If there is none, it stands still, or, if an
-    obstacle comes towards it, gives way as far as fixed obstacles allow. An arm with less than half
-    of a margin left brakes too: it only withdraws, whatever is asked for, and its tool does not go
-    down if it can withdraw otherwise.
+    motion that exceeds s as little as possible, and uses up no more than all the room. If there is
+    none, it stands still, or, if an obstacle comes towards it, gives way as far as fixed obstacles
+    allow. An arm with less than half of a margin left brakes too: it only withdraws, whatever is
+    asked for, and its tool does not go down if it can withdraw otherwise.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
