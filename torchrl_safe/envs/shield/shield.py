@@ -22,8 +22,9 @@ _ERROR = 0.1
 _SHORTEST, _FAR = 1e-3, 1e3
 # Below this, a distance counts as 0, m.
 _TOLERANCE = 1e-9
-# What an arm that brakes comes too near counts as much as this turn of a joint, m/rad.
-_GIVES = 1e-3
+# What an arm that brakes comes too near counts as much as this turn of a joint, m/rad. With much
+# less, rows that only differ in it would be nearly dependent.
+_GIVES = 1e-2
 # The share of the joints' braking that a distance counts on: some joints may have to keep turning.
 _SURE = 1 / 3
 
