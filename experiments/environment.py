@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
@@ -19,6 +20,7 @@ from torchrl_safe.envs import (
     Collision,
     ContactForce,
     FullObservation,
+    Human,
     JointDelta,
     JointLimit,
     MuJoCo,
@@ -55,6 +57,8 @@ COSTS: dict[str, Cost] = {
     # Actions ask for up to 1 m/s along each axis.
     "speed": Speed(limit=1.0),
 }
+# Of a hand that reaches as far and as fast as Human's, 0.6 m in 0.7 s, with minimum jerk, m/s^2.
+_HAND = 8.0
 
 
 def make_env(
@@ -84,11 +88,11 @@ def make_env(
     if config.paper:
         env = paper_env(PAPER_ACTIONS[config.action], **settings)
     else:
-        env = ArmEnv(
-            physics=PHYSICS[config.physics],
-            shield=ALGORITHMS[algorithm].shield if shielded else None,
-            **{**arm_arguments(config, shielded), **settings},
-        )
+        arguments = arm_arguments(config, shielded)
+        shield = ALGORITHMS[algorithm].shield if shielded else None
+        if shield is not None and isinstance(arguments["obstacles"], Human):
+            shield = replace(shield, obstacle_acceleration=_HAND)
+        env = ArmEnv(physics=PHYSICS[config.physics], shield=shield, **{**arguments, **settings})
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = ALGORITHMS[algorithm].transforms(config)
     if training:

@@ -177,6 +177,9 @@ def main():
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--layouts", nargs="+", choices={**FIXED, **MOVING}, default=list(FIXED))
     parser.add_argument("--obstacle-speed", type=float, help="that the shield expects, m/s")
+    parser.add_argument(
+        "--obstacle-acceleration", type=float, default=0.0, help="that the shield expects, m/s^2"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/attack.json"), help="what is done")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -185,7 +188,9 @@ def main():
     each = -(-options.steps // (len(cases) * options.envs))
     done = json.loads(options.out.read_text()) if options.out.exists() else {}
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    shield = Shield(obstacle_speed=options.obstacle_speed)
+    shield = Shield(
+        obstacle_speed=options.obstacle_speed, obstacle_acceleration=options.obstacle_acceleration
+    )
     names = [
         f"{options.physics} {arm} {action} {layout} {attack}, {each} x {options.envs}, {shield}"
         for arm, action, layout, attack in cases

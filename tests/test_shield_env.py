@@ -137,6 +137,7 @@ def test_a_correction_needs_a_shield():
         {"reach": 0.01},
         {"acceleration": -1.0},
         {"tool_weight": -1.0},
+        {"obstacle_acceleration": -1.0},
         {"obstacle_speed": -1.0},
     ],
     ids=lambda settings: next(iter(settings)),

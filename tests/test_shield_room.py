@@ -60,6 +60,14 @@ def test_what_goes_away_may_stop():
     np.testing.assert_allclose(done.joints, SHARE * 0.13)
 
 
+@pytest.mark.parametrize(("speed", "comes"), [(0.4, 0.02 + 0.01), (0.0, 0.0), (-0.4, 0.0)])
+def test_what_moves_may_become_faster(speed, comes):
+    """By 8 m/s^2, half of it on average over the 50 ms of the step; what rests does not."""
+    state = {"obstacle_velocity": np.tile([0, speed, 0], (2, 1, 1))}
+    done = shielded(Wall(0.15), state=state, obstacle_acceleration=8.0)
+    np.testing.assert_allclose(done.joints, SHARE * 0.13 - comes)
+
+
 def test_what_turns_comes_nearer():
     """2 rad/s, 0.2 m off the axis."""
     spin = {

@@ -125,9 +125,9 @@ class Shield:
     - there is a solution. An arm that has to brake from full speed needs some distance for it.
 
     From moving obstacles the arm withdraws as far as its joints allow. Their future is unknown, so
-    the guarantee is weaker: the arm is not the one that moves into contact, as long as they do not
-    become faster than ``obstacle_speed``. The arm's own links and what its gripper holds are not
-    checked.
+    the guarantee is weaker: the arm is not the one that moves into contact, as long as they change
+    their velocity by no more than ``obstacle_acceleration``, or do not become faster than
+    ``obstacle_speed``. The arm's own links and what its gripper holds are not checked.
 
     **Learning.** The batch holds the action that the policy sampled, and its
     log-probability. The shield is a part of the environment: it maps state and action to joint
@@ -143,9 +143,10 @@ class Shield:
         table: distance that the arm keeps from the table, m. To the shield the table has no edges.
         reach: distance up to which the shield measures, m. A larger one takes longer.
         acceleration: change of velocity that the motors follow, rad/s^2.
-        obstacle_speed: if given, the shield expects that obstacles can come this fast at any time,
-            m/s, and the arm is not the one that moves into contact. ``None`` expects them to keep
-            their velocity.
+        obstacle_acceleration: change of velocity that the shield expects of obstacles that move,
+            m/s^2. With 0 they keep their velocity. A hand that reaches takes about 8.
+        obstacle_speed: if given, the shield also expects that obstacles can come this fast at any
+            time, m/s, and the arm is not the one that moves into contact.
         workspace: if given, the tool point stays in this box, the margin away from its walls. If
             it begins outside, it moves in. Where there is no solution, a fast tool may leave it by
             a centimetre while the arm brakes.
@@ -171,12 +172,14 @@ class Shield:
     table: float = 0.02
     reach: float = 0.3
     acceleration: float = 10.0
+    obstacle_acceleration: float = 0.0
     obstacle_speed: float | None = None
     workspace: Region | None = None
     tool_weight: float = 10.0
 
     def __post_init__(self) -> None:
         check_not_negative(margin=self.margin, table=self.table, tool_weight=self.tool_weight)
+        check_not_negative(obstacle_acceleration=self.obstacle_acceleration)
         check_positive(rate=self.rate, reach=self.reach, acceleration=self.acceleration)
         if self.reach <= max(self.margin, self.table):
             raise ValueError(
@@ -285,6 +288,8 @@ class Shield:
             arm = near.point - position
             speed = ((velocity + cross(spin, arm)) * near.normal).sum(axis=2)
             # An obstacle that goes away may stop at any time.
+            moves = (velocity != 0).any(axis=2) | (spin != 0).any(axis=2)
+            speed = speed + moves * self.obstacle_acceleration * step.duration / 2
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         lever = _lever(joints)
