@@ -287,9 +287,9 @@ class Shield:
             # As fast along the normal as the nearest point of the obstacle, which is on that line.
             arm = near.point - position
             speed = ((velocity + cross(spin, arm)) * near.normal).sum(axis=2)
-            # An obstacle that goes away may stop at any time.
             moves = (velocity != 0).any(axis=2) | (spin != 0).any(axis=2)
-            speed = speed + moves * self.obstacle_acceleration * step.duration / 2
+            speed += moves * self.obstacle_acceleration * step.duration / 2
+            # An obstacle that goes away may stop at any time.
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         lever = _lever(joints)
@@ -437,10 +437,11 @@ def _solve(
     braked = ~solved
     some = np.flatnonzero(braked)
     if len(some):
+        both = np.concatenate([least[some], last[some]], axis=1)
         change[some], solved[some] = _slowest(
             np.concatenate([rows[some]] * 2, axis=1),
-            np.concatenate([least[some], last[some]], axis=1),
-            np.arange(2 * rows.shape[1]) < rows.shape[1],
+            both,
+            np.arange(both.shape[1]) < rows.shape[1],
             lower[some],
             upper[some],
         )
