@@ -180,6 +180,7 @@ def main():
     parser.add_argument(
         "--obstacle-acceleration", type=float, default=0.0, help="that the shield expects, m/s^2"
     )
+    parser.add_argument("--tool-weight", type=float, default=0.0, help="of the shield, rad/m")
     parser.add_argument("--out", type=Path, default=Path("runs/attack.json"), help="what is done")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -189,7 +190,9 @@ def main():
     done = json.loads(options.out.read_text()) if options.out.exists() else {}
     options.out.parent.mkdir(parents=True, exist_ok=True)
     shield = Shield(
-        obstacle_speed=options.obstacle_speed, obstacle_acceleration=options.obstacle_acceleration
+        obstacle_speed=options.obstacle_speed,
+        obstacle_acceleration=options.obstacle_acceleration,
+        tool_weight=options.tool_weight,
     )
     names = [
         f"{options.physics} {arm} {action} {layout} {attack}, {each} x {options.envs}, {shield}"

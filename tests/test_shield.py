@@ -373,7 +373,8 @@ def test_the_table_is_left_alone(make_env, engine):
     ids=["push", "pick"],
 )
 def test_it_lets_an_arm_push_and_pick_up(make_env, task, obstacles):
-    """Down to the table, and beside the obstacle, where a hand needs a smaller margin."""
+    """Down to the table, and beside the obstacle: with a smaller margin, and a hand that turns."""
+    shield = Shield(margin=0.01, tool_weight=10.0)
     action = CartesianDelta(
         step=0.03,
         orientation=PANDA.handling_orientation,
@@ -382,7 +383,7 @@ def test_it_lets_an_arm_push_and_pick_up(make_env, task, obstacles):
     settings = {"task": task, "obstacles": obstacles, "action": action, "seed": 3}
     settings["max_episode_steps"] = 200
     physics = ENGINES["mujoco"]
-    env = make_env(ArmEnv, num_envs=4, physics=physics, shield=Shield(margin=0.01), **settings)
+    env = make_env(ArmEnv, num_envs=4, physics=physics, shield=shield, **settings)
     env.reset()
     pilot, alive, success = make_pilot(env), torch.ones(4, 1, dtype=torch.bool), 0
     while alive.any():

@@ -84,9 +84,9 @@ class Shield:
         \nabla d_i^\top x - c_i \ge -s(r_i) \quad\text{for all } i, \qquad l \le x \le u
 
     J is the Jacobian of the tool point, the unit vector t is where w would move it, and
-    :math:`\kappa` is ``tool_weight``. Joints that can give way without slowing the tool down give
-    way first: a hand turns to pass an obstacle. The tool may move aside. T is the duration of the
-    control step, c how far the obstacle comes nearer in it, and s a control barrier function in
+    :math:`\kappa` is ``tool_weight``. If it is not 0, joints that can give way without slowing the
+    tool down do so: a hand turns to pass an obstacle. The tool may move aside. T is the duration of
+    the control step, c how far the obstacle comes nearer in it, and s a control barrier function in
     discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and Sreenath 2017, RSS), with which
     the arm can always stop:
 
@@ -151,7 +151,8 @@ class Shield:
             it begins outside, it moves in. Where there is no solution, a fast tool may leave it by
             a centimetre while the arm brakes.
         tool_weight: how much a metre that the tool point falls short counts against a radian that
-            a joint does, rad/m. With 0, only joints count.
+            a joint does, rad/m. With 0, only joints count. With more, policies lose less return,
+            but joints can become faster than asked for.
 
     Raises:
         TypeError: if ``workspace`` is not a Region.
@@ -175,7 +176,7 @@ class Shield:
     obstacle_acceleration: float = 0.0
     obstacle_speed: float | None = None
     workspace: Region | None = None
-    tool_weight: float = 10.0
+    tool_weight: float = 0.0
 
     def __post_init__(self) -> None:
         check_not_negative(margin=self.margin, table=self.table, tool_weight=self.tool_weight)
