@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from itertools import product
 from time import perf_counter
@@ -143,19 +143,29 @@ def what_a_shield_costs(quick: bool) -> Iterator[Figure]:
     """The same random actions with a shield and without, beside one obstacle."""
     worlds, steps, rounds = (2, 4, 2) if quick else (32, 16, 9)
     engines: dict[str, Physics] = {"MuJoCo": MuJoCo(1), "Bullet": Bullet()}
+    weighted = Shield(tool_weight=10.0)
+    shields = {"none": None, "Shield": Shield(), "Shield(tool_weight=10)": weighted}
     for (name, action), (engine, physics) in product(ACTIONS.items(), engines.items()):
-        settings: dict[str, Any] = {"action": action, "max_episode_steps": ENDLESS}
-        make = partial(ArmEnv, num_envs=worlds, physics=physics, **settings)
-        with closing(make()) as plain, closing(make(shield=Shield())) as shielded:
-            times = race(
-                {"none": rollout(plain, steps), "Shield": rollout(shielded, steps)}, rounds=rounds
-            )
-        yield ratio(
-            f"{name}, substeps 12, {worlds} worlds, {engine}: Shield / none (time)",
-            times["Shield"],
-            times["none"],
-            at_most=1.5,
+        make = partial(
+            ArmEnv,
+            num_envs=worlds,
+            action=action,
+            physics=physics,
+            max_episode_steps=ENDLESS,
         )
+        with ExitStack() as open_:
+            rollouts = {
+                label: rollout(open_.enter_context(closing(make(shield=shield))), steps)
+                for label, shield in shields.items()
+            }
+            times = race(rollouts, rounds=rounds)
+        for label in list(shields)[1:]:
+            yield ratio(
+                f"{name}, substeps 12, {worlds} worlds, {engine}: {label} / none (time)",
+                times[label],
+                times["none"],
+                at_most=1.5,
+            )
 
 
 def against_panda_gym(quick: bool) -> Iterator[Figure]:

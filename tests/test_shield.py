@@ -373,17 +373,16 @@ def test_the_table_is_left_alone(make_env, engine):
     ids=["push", "pick"],
 )
 def test_it_lets_an_arm_push_and_pick_up(make_env, task, obstacles):
-    """Down to the table, and beside the obstacle: with a smaller margin, and a hand that turns."""
-    shield = Shield(margin=0.01, tool_weight=10.0)
+    """Down to the table, and beside the obstacle, where a hand needs a smaller margin."""
     action = CartesianDelta(
         step=0.03,
         orientation=PANDA.handling_orientation,
         finger_step=0.04 if isinstance(task, PickAndPlace) else None,
     )
-    settings = {"task": task, "obstacles": obstacles, "action": action, "seed": 3}
+    settings = {"task": task, "obstacles": obstacles, "action": action, "seed": 0}
     settings["max_episode_steps"] = 200
     physics = ENGINES["mujoco"]
-    env = make_env(ArmEnv, num_envs=4, physics=physics, shield=shield, **settings)
+    env = make_env(ArmEnv, num_envs=4, physics=physics, shield=Shield(margin=0.01), **settings)
     env.reset()
     pilot, alive, success = make_pilot(env), torch.ones(4, 1, dtype=torch.bool), 0
     while alive.any():
@@ -413,7 +412,7 @@ def test_what_the_fingers_use_up_counts_when_it_looks_ahead():
     world = _Fist()
     joint = dict.fromkeys(("joint_position", "joint_velocity", "finger_position"), np.zeros((2, 1)))
     state = make_state(**joint, joint_lower=[-9.0], joint_upper=[9.0])
-    shield = Shield(margin=0.0, table=0.0, acceleration=1e4, tool_weight=0.0)
+    shield = Shield(margin=0.0, table=0.0, acceleration=1e4)
     asked = np.full((2, 1), 0.2), np.full((2, 1), 0.0315)
     done = shield(*asked, state, world, longest=np.array([0.2]), duration=0.05)
     assert len(world.measured) == 2

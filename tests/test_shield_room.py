@@ -38,7 +38,7 @@ def shielded(world, asked=0.2, fingers=0.0, state=None, **settings):
         "joint_upper": np.array([9.0]),
         **(state or {}),
     }
-    shield = Shield(**{"acceleration": 1e4, "tool_weight": 0, **settings})
+    shield = Shield(**{"acceleration": 1e4, **settings})
     return shield(
         one + asked,
         held + fingers,

@@ -179,8 +179,12 @@ class Shield:
     tool_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        check_not_negative(margin=self.margin, table=self.table, tool_weight=self.tool_weight)
-        check_not_negative(obstacle_acceleration=self.obstacle_acceleration)
+        check_not_negative(
+            margin=self.margin,
+            table=self.table,
+            obstacle_acceleration=self.obstacle_acceleration,
+            tool_weight=self.tool_weight,
+        )
         check_positive(rate=self.rate, reach=self.reach, acceleration=self.acceleration)
         if self.reach <= max(self.margin, self.table):
             raise ValueError(
