@@ -32,12 +32,13 @@ def distance_jacobian(
         >>> distance_jacobian(point, along_y, origin, about_z, np.array([False]))
         array([[[2.]]])
     """
-    lines = np.concatenate([cross(point, normal), normal], axis=2)
     turning, moving = axis, cross(anchor, axis)
     if slides.any():
         slides = slides[:, None]
         turning, moving = np.where(slides, 0.0, axis), np.where(slides, axis, moving)
-    return lines @ np.concatenate([turning, moving], axis=2).transpose(0, 2, 1)
+    by_turning = cross(point, normal) @ turning.transpose(0, 2, 1)
+    by_moving: Array = normal @ moving.transpose(0, 2, 1)
+    return by_turning + by_moving
 
 
 def moves(parents: Sequence[int], links: Sequence[int]) -> NDArray[np.bool_]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,7 +68,7 @@ def project(
         return point, solved
     # With y = (1 + k k^T)^(1/2) x, the distance between y is the one that counts.
     outer = along[open_, :, None] * along[open_, None]
-    length = np.sqrt(1 + np.einsum("kii->k", outer))[:, None, None]
+    length = np.sqrt(1 + np.einsum("kn,kn->k", along[open_], along[open_]))[:, None, None]
     root = np.eye(wanted.shape[1]) + outer / (1 + length)
     back = np.eye(wanted.shape[1]) - outer / (length + length**2)
     target = (root @ target[:, :, None])[:, :, 0]
@@ -103,6 +101,9 @@ def _active_set(point: Array, rows: Array, least: Array) -> tuple[Array, NDArray
     # Up to n active constraints of each problem: their rows, multipliers and numbers.
     normals, multipliers = np.zeros((count, width, width)), np.zeros((count, width))
     active = np.full((count, width), -1)
+    # The dual basis of those rows: 1 along its own row, 0 along the others. What the rows share of
+    # a vector is its products with the duals.
+    duals = np.zeros_like(normals)
     # Those that are active are not looked at until they are dropped.
     watched = least.copy()
     # The constraint that is being added, and its multiplier so far.
@@ -117,12 +118,10 @@ def _active_set(point: Array, rows: Array, least: Array) -> tuple[Array, NDArray
         open_ &= ~solved
         if not open_.any():
             break
-        normal, held = rows[each, entering], active >= 0
+        normal = rows[each, entering]
         # The part of it that the active ones do not span, and how much of each is in the rest.
-        gram = normals @ normals.transpose(0, 2, 1)
-        np.einsum("kii->ki", gram)[:] += ~held
-        shares, singular = _solve(gram, normals @ normal[:, :, None])
-        free = normal - (normals * shares[:, :, None]).sum(axis=1)
+        shares = (duals @ normal[:, :, None])[:, :, 0]
+        free = normal - (shares[:, None] @ normals)[:, 0]
         length = (free * normal).sum(axis=1)
         # How far until the constraint holds, or the multiplier of an active one is used up.
         full = np.divide(-missing, length, out=never[:, 0].copy(), where=length > _SPANNED)
@@ -131,32 +130,30 @@ def _active_set(point: Array, rows: Array, least: Array) -> tuple[Array, NDArray
         limit = limits[each, last]
         step = np.minimum(full, limit)
         # Neither will ever happen: there is no solution.
-        open_ &= np.isfinite(step) & ~singular
+        open_ &= np.isfinite(step)
         step = np.where(open_, step, 0.0)
         point = point + np.where(length > _PARALLEL, step, 0.0)[:, None] * free
         multipliers -= step[:, None] * shares
         weight += step
         joins = np.flatnonzero(open_ & (full <= limit))
-        drops = np.flatnonzero(open_ & (full > limit))
         # Into the first slot that is not taken: there is one, for the others do not span it.
-        slot = held[joins].argmin(axis=1)
+        slot = (active[joins] < 0).argmax(axis=1)
         normals[joins, slot], multipliers[joins, slot] = normal[joins], weight[joins]
+        dual = free[joins] / length[joins, None]
+        duals[joins] -= shares[joins, :, None] * dual[:, None]
+        duals[joins, slot] = dual
         active[joins, slot] = added = entering[joins]
         watched[joins, added] = -np.inf
         entering[joins], weight[joins] = -1, 0.0
-        slot = last[drops]
-        gone = active[drops, slot]
-        watched[drops, gone] = least[drops, gone]
-        normals[drops, slot], multipliers[drops, slot], active[drops, slot] = 0.0, 0.0, -1
+        drops = np.flatnonzero(open_ & (full > limit))
+        if len(drops):
+            slot = last[drops]
+            gone = active[drops, slot]
+            watched[drops, gone] = least[drops, gone]
+            active[drops, slot] = -1
+            dual = duals[drops, slot]
+            shared = (duals[drops] @ dual[:, :, None])[:, :, 0] / (dual * dual).sum(axis=1)[:, None]
+            duals[drops] -= shared[:, :, None] * dual[:, None]
+            duals[drops, slot] = 0.0
     # Those that are active have not been looked at again.
     return point, solved & ((rows @ point[:, :, None])[:, :, 0] >= least - _ROUNDING).all(axis=1)
-
-
-def _solve(gram: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Solves ``(N, n, n)`` equations; also returns which have no solution, ``(N,)``."""
-    try:
-        return np.linalg.solve(gram, right)[:, :, 0], np.zeros(len(gram), dtype=bool)
-    except np.linalg.LinAlgError:  # One such problem is not the others' end.
-        singular = np.linalg.matrix_rank(gram, hermitian=True) < gram.shape[1]
-        gram = np.where(singular[:, None, None], np.eye(gram.shape[1]), gram)
-        return np.linalg.solve(gram, right)[:, :, 0], singular

@@ -390,7 +390,8 @@ class Shield:
 
 def _lever(joints: Array) -> Array:
     """By how much all joints together can change a distance, m/rad, ``(k, r)``."""
-    return np.abs(joints).sum(axis=2)
+    lever: Array = np.abs(joints) @ np.ones(joints.shape[2])  # Twice as fast as sum().
+    return lever
 
 
 def _needed(kept: Array, then: _Pairs) -> Array:
@@ -414,8 +415,8 @@ def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
 
     The middle of the bounds is how they turn now. What is left of a wish is not coming nearer.
     """
-    best = np.maximum(rows * upper[:, None], rows * lower[:, None]).sum(axis=2)
     middle = (rows @ (0.5 * (lower + upper))[:, :, None])[:, :, 0]
+    best = middle + (np.abs(rows) @ (0.5 * (upper - lower))[:, :, None])[:, :, 0]
     return np.minimum(least, np.maximum((best + np.maximum(middle, 0)) / 2, 0))
 
 

@@ -129,16 +129,17 @@ class Ruler:
             # Naming all of them takes longer.
             named = None if len(rows) == len(self._qpos) else rows.tolist()
             self._batch.forward(named, stage=mujoco.mjtStage.mjSTAGE_POS)
-        worlds = rows[:, None]
         ends = self._points[rows].reshape(len(rows), len(self._other), 2, 3)
         point, way = ends[:, :, 0], ends[:, :, 0] - ends[:, :, 1]
         distance = np.sqrt(np.einsum("kri,kri->kr", way, way))
         found = ends.any(axis=(2, 3))
         # Where they overlap, the two points have changed sides.
-        outward = self._centres[worlds, self._geom] - point
+        outward = self._centres[rows].take(self._geom, axis=1) - point
         sign = np.where(np.einsum("kri,kri->kr", outward, way) < 0, -1.0, 1.0)
         normal = way * (sign / np.where(distance > 0, distance, 1.0))[..., None]
         distance *= sign
-        anchor, axis = self._anchors[worlds, self._joints], self._axes[worlds, self._joints]
+        anchor, axis = (
+            part[rows].take(self._joints, axis=1) for part in (self._anchors, self._axes)
+        )
         jacobian = distance_jacobian(point, normal, anchor, axis, self._slides) * self._moves
         return Nearest(np.where(found, distance, np.inf), normal, point, jacobian, self._other)
