@@ -196,7 +196,7 @@ def test_the_tool_goes_on_where_other_joints_can_give_way(make_env, engine):
     jacobian = simulator.jacobian(state.joint_position)[:, :3]
     way = (jacobian @ (asked - state.joint_position)[:, :, None])[:, :, 0]
     speeds = {"longest": simulator.joint_speed / env.control_rate, "duration": 1 / env.control_rate}
-    missed, turned = [], []
+    missed, turned, fastest = [], [], []
     for tool_weight in (0.0, 10.0):
         shield = Shield(rate=1.0, acceleration=1e3, tool_weight=tool_weight)
         done = shield(asked, fingers, state, simulator, **speeds)
@@ -205,8 +205,13 @@ def test_the_tool_goes_on_where_other_joints_can_give_way(make_env, engine):
         tool = (jacobian @ change[:, :, None])[:, :, 0]
         missed.append(np.abs((tool * way).sum(axis=1)))
         turned.append(np.linalg.norm(change, axis=1))
+        fastest.append(np.abs(done.joints - state.joint_position).max(axis=1))
     assert (missed[1] < missed[0]).all()
     assert (turned[1] > turned[0]).all()
+    # No joint turns further than the largest turn that is asked for.
+    most = np.abs(asked - state.joint_position).max(axis=1)
+    assert (fastest[1] <= most + 1e-9).all()
+    assert np.isclose(fastest[1], most).any()
 
 
 def test_far_from_everything_a_shield_does_nothing(make_env, engine, turntable):
@@ -223,12 +228,12 @@ def test_what_comes_is_given_way_to(make_env, engine, turntable):
     """A ball that comes at 0.4 m/s pushes the bar, which is to rest, away before it touches it."""
     start = (0.45, 0.25, 0.5)
     layout = Places(Sphere(0.1), at=[start], path=at_speed(start, (0, -0.4, 0)))
-    for shield in (None, Shield()):
+    for shield in (None, Shield(), Shield(tool_weight=10.0)):
         env = make_env(ArmEnv, **{**turntable, "obstacles": layout, "shield": shield})
         env.reset()
         costs = torch.cat([step(env, 0.0)["cost"] for _ in range(10)])
         assert costs.any() == (shield is None)
-    assert env.arm_state.joint_position[0, 0] < -0.1
+        assert shield is None or env.arm_state.joint_position[0, 0] < -0.1
 
 
 def test_what_comes_is_given_way_to_as_far_as_what_stands_allows(make_env, engine, turntable):
