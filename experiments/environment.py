@@ -58,7 +58,7 @@ COSTS: dict[str, Cost] = {
     "speed": Speed(limit=1.0),
 }
 # Of a hand that reaches as far and as fast as Human's, 0.6 m in 0.7 s, with minimum jerk, m/s^2.
-_HAND = 8.0
+_HAND = 7.0
 
 
 def make_env(

@@ -102,8 +102,8 @@ def test_fingers_use_up_room_too():
 
 
 def test_the_reach_is_more_than_the_margin_of_the_table():
-    with pytest.raises(ValueError, match=r"reach must be larger than .* and table = 0.4"):
-        Shield(table=0.4)
+    with pytest.raises(ValueError, match=r"reach must be larger than .* and table = 0.6"):
+        Shield(table=0.6)
 
 
 def test_each_shape_may_use_up_what_its_nearest_pair_may():

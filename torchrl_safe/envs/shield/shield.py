@@ -145,7 +145,7 @@ class Shield:
         reach: distance up to which the shield measures, m. A larger one takes longer.
         acceleration: change of velocity that the motors follow, rad/s^2.
         obstacle_acceleration: change of velocity that the shield expects of obstacles that move,
-            m/s^2. With 0 they keep their velocity. A hand that reaches takes about 8.
+            m/s^2. With 0 they keep their velocity. A hand that reaches takes about 7.
         obstacle_speed: if given, the shield also expects that obstacles can come this fast at any
             time, m/s, and the arm is not the one that moves into contact.
         workspace: if given, the tool point stays in this box, the margin away from its walls. If
@@ -171,7 +171,7 @@ class Shield:
     margin: float = 0.02
     rate: float = 20.0
     table: float = 0.02
-    reach: float = 0.3
+    reach: float = 0.5
     acceleration: float = 10.0
     obstacle_acceleration: float = 0.0
     obstacle_speed: float | None = None
