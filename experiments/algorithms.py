@@ -291,7 +291,7 @@ _BELOW = {"limit_share": 0.8}
 _A2C = {"frames": 768_000, "frames_per_batch": 512, "minibatch": 128, "multiplier_rate": 0.01}
 # Nearer and faster than the default, and less safe in PyBullet. In MuJoCo, where these policies are
 # trained, the motors follow twice as large a change of velocity.
-_SHIELD = Shield(margin=0.0075, rate=40.0, table=0.015, acceleration=20.0, tool_weight=10.0)
+_SHIELD = Shield(margin=0.0075, rate=40.0, table=0.015, acceleration=20.0)
 ALGORITHMS: dict[AlgorithmName, Algorithm] = {
     "ppo": OnPolicy(_of_ppo(PPOLagrangianLoss), keep_multiplier, compiles=True),
     "ppo-shield": OnPolicy(

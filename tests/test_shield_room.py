@@ -68,6 +68,15 @@ def test_what_moves_may_become_faster(speed, comes):
     np.testing.assert_allclose(done.joints, SHARE * 0.13 - comes)
 
 
+def test_it_can_stop_before_what_comes_is_there():
+    """At 0.4 m/s: x in this step, x - brake in the next and so on, until all the room is gone."""
+    state = {"obstacle_velocity": np.tile([0, 0.4, 0], (2, 1, 1))}
+    turned = shielded(Wall(0.15), state=state, rate=1e3, acceleration=20).joints
+    brake = 20 * 0.05**2 / 3
+    steps = turned / brake
+    np.testing.assert_allclose(turned * (steps + 1) / 2 + 0.02 * (steps + 1), 0.13)
+
+
 def test_what_turns_comes_nearer():
     """2 rad/s, 0.2 m off the axis."""
     spin = {
@@ -181,11 +190,17 @@ class Bend:
         jacobian = (turned * self.gradient)[..., None]
         return Nearest(distance, nothing, nothing, jacobian, np.zeros(len(self.there), int))
 
+    def jacobian(self, angles):
+        return np.zeros((len(angles), 6, 1))
+
 
 def test_another_step_like_this_has_to_be_safe():
-    """Slower by a third of 10 rad/s^2; where it ends there are 5 cm to stop in."""
+    """Where it ends there are 5 cm to stop in, with a quarter of a third of 10 rad/s^2.
+
+    It comes nearer only at the end of the step, so that the rest goes into what bends its way.
+    """
     done = shielded(Bend(0.01, [0.05], [-1.0]), margin=0, table=0, rate=1e3, acceleration=10)
-    brake = 10 * 0.05**2 / 3
+    brake = 10 * 0.05**2 / 3 / 4
     stops = np.sqrt(brake**2 / 4 + 2 * brake * 0.05) - brake / 2
     np.testing.assert_allclose(done.joints, stops + brake)
 

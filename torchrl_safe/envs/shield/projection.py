@@ -101,8 +101,8 @@ def _active_set(point: Array, rows: Array, least: Array) -> tuple[Array, NDArray
     # Up to n active constraints of each problem: their rows, multipliers and numbers.
     normals, multipliers = np.zeros((count, width, width)), np.zeros((count, width))
     active = np.full((count, width), -1)
-    # The dual basis of those rows: 1 along its own row, 0 along the others. What the rows share of
-    # a vector is its products with the duals.
+    # The dual basis of those rows: each has the product 1 with its own row and 0 with the others. A
+    # vector's products with them are how much of each row is in it.
     duals = np.zeros_like(normals)
     # Those that are active are not looked at until they are dropped.
     watched = least.copy()

@@ -27,6 +27,8 @@ _TOLERANCE = 1e-9
 _GIVES = 1e-2
 # The share of the joints' braking that a distance counts on: some joints may have to keep turning.
 _SURE = 1 / 3
+# The share of that which is left at least where points move on curves.
+_LEAST = 1 / 4
 
 
 class Shielded(NamedTuple):
@@ -92,13 +94,14 @@ class Shield:
     with which the arm can always stop:
 
     .. math::
-        s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\ \sqrt{b^2 / 4 + 2 b r} - b / 2\right),
-        \qquad b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
+        s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\
+        \sqrt{(b / 2 + c)^2 + 2 b\, (r - c)} - b / 2\right), \qquad
+        b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
 
-    The first part is a share of the room. The second leaves enough room to stop if the distance
-    shrinks by b less in each following step; b is a third of what all joints together can do.
-    Inside the margin, where r is negative, :math:`s = (1 - e^{-\text{rate} \cdot T}) r` makes the
-    arm move away.
+    The first part is a share of the room. The second leaves enough room to stop, while the obstacle
+    comes nearer by c in each step, if the arm comes nearer by b less in each following step; b is a
+    third of what all joints together can do. Inside the margin, where r is negative,
+    :math:`s = (1 - e^{-\text{rate} \cdot T}) r` makes the arm move away.
 
     The bounds l and u keep joint targets within limits and speeds, and within what motors can
     follow. What is asked for is clipped to them first. A joint's velocity changes by no more than
@@ -107,7 +110,8 @@ class Shield:
 
     The problem treats distances as linear, which is not exact. Where the end of the step could be
     too near, the shield measures the distances there as well and solves a second problem with them.
-    In it, one more step like this one, slower by b, has to be safe too.
+    In it, one more step like this one, slower by b, has to be safe too. What points on curves
+    approach faster at the end than now is taken off this b, which keeps at least a quarter.
 
     If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
     motion that exceeds s as little as possible, and uses up no more than all the room. If there is
@@ -152,7 +156,7 @@ class Shield:
             it begins outside, it moves in. Where there is no solution, a fast tool may leave it by
             a centimetre while the arm brakes.
         tool_weight: how much a metre that the tool point falls short counts against a radian that
-            a joint does, rad/m. With 0, only joints count. With 10, policies lose less return.
+            a joint does, rad/m. With 0, only joints count, and policies lose more return.
 
     Raises:
         TypeError: if ``workspace`` is not a Region.
@@ -176,7 +180,7 @@ class Shield:
     obstacle_acceleration: float = 0.0
     obstacle_speed: float | None = None
     workspace: Region | None = None
-    tool_weight: float = 0.0
+    tool_weight: float = 10.0
 
     def __post_init__(self) -> None:
         check_not_negative(
@@ -244,10 +248,18 @@ class Shield:
         again = np.flatnonzero(solved & doubt)
         if len(again):
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
-            turned = (then.joints @ change[again][:, :, None])[:, :, 0]
+            before, turned = (
+                (joints @ change[again][:, :, None])[:, :, 0]
+                for joints in (near.joints[again], then.joints)
+            )
             needed = _needed((near.room - near.spare)[again], then) + turned
-            # One more step like this one, slowed as far as possible, has to be safe there.
-            needed = np.maximum(needed, then.closing - then.spare - self._brake(step, then.lever))
+            # One more step like this one, slowed as far as possible, has to be safe there. Braking
+            # also makes up for what distances shrink faster at the end, as points move on curves.
+            both = np.isfinite(near.room[again] + then.room)
+            brake = self._brake(step, then.lever)
+            brake = np.maximum(brake + both * np.minimum(turned - before, 0), _LEAST * brake)
+            spare = self._spare(step, then.room, brake, then.closing)
+            needed = np.maximum(needed, then.closing - spare - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
             # What satisfies these too is the solution of both.
@@ -298,7 +310,7 @@ class Shield:
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         lever = _lever(joints)
-        spare = self._spare(step, room, lever)
+        spare = self._spare(step, room, self._brake(step, lever), closing)
         return _Pairs(room, spare, closing, joints, moved, lever, near.other)
 
     def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
@@ -311,13 +323,13 @@ class Shield:
         least = -np.where(table, self.table, self.margin) / 2
         return np.any(now.room < least, axis=1)
 
-    def _spare(self, step: _Step, room: Array, lever: Array) -> Array:
+    def _spare(self, step: _Step, room: Array, brake: Array, closing: Array | float) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
         share = step.share * room
-        brake = self._brake(step, lever)
-        some = np.where(np.isfinite(room), np.maximum(room, 0), 0.0)
-        # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
-        stops = np.sqrt(brake * (brake / 4 + 2 * some)) - brake / 2
+        some = np.where(np.isfinite(room), np.maximum(room - closing, 0), 0.0)
+        # The arm x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
+        # Meanwhile the obstacle x / brake times what it takes in a step, and once more.
+        stops = np.sqrt((brake / 2 + closing) ** 2 + 2 * brake * some) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
 
     def _brake(self, step: _Step, lever: Array) -> Array:
@@ -331,7 +343,8 @@ class Shield:
             return least
         moves = now.other < step.state.obstacle_position.shape[1]
         come = step.duration * self.obstacle_speed * moves
-        return np.maximum(least, np.minimum(come - now.spare, 0))
+        spare = self._spare(step, now.room, self._brake(step, now.lever), come)
+        return np.maximum(least, np.minimum(come - spare, 0))
 
     def _bounds(self, step: _Step, now: _Pairs, longest: Array) -> tuple[Array, Array]:
         """How far the joints may turn, rad, each ``(N, n)``."""
@@ -374,7 +387,8 @@ class Shield:
             tool, ways = step.state.ee_position, np.concatenate([linear, -linear], axis=1)
             left = np.concatenate([tool - walls.low, walls.high - tool], axis=1) - self.margin
             room = np.concatenate([room, left], axis=1)
-            spare = np.concatenate([spare, self._spare(step, left, _lever(ways))], axis=1)
+            brake = self._brake(step, _lever(ways))
+            spare = np.concatenate([spare, self._spare(step, left, brake, 0.0)], axis=1)
             joints = np.concatenate([joints, ways], axis=1)
         number = step.state.obstacle_position.shape[1] + 1
         return _Pairs(
@@ -477,15 +491,9 @@ def _give_way(
     """
     if along is None:
         return project(asked, rows, least, lower, upper)
-    fastest = np.abs(asked).max(axis=1, keepdims=True)
-    change, solved = project(
-        asked,
-        rows,
-        least,
-        np.clip(-fastest, lower, upper),
-        np.clip(fastest, lower, upper),
-        along,
-    )
+    most = np.abs(asked).max(axis=1, keepdims=True)
+    slow = np.clip(-most, lower, upper), np.clip(most, lower, upper)
+    change, solved = project(asked, rows, least, *slow, along)
     # To withdraw can need more.
     some = np.flatnonzero(~solved)
     if len(some):
