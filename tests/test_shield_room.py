@@ -68,13 +68,17 @@ def test_what_moves_may_become_faster(speed, comes):
     np.testing.assert_allclose(done.joints, SHARE * 0.13 - comes)
 
 
-def test_it_can_stop_before_what_comes_is_there():
-    """At 0.4 m/s: x in this step, x - brake in the next and so on, until all the room is gone."""
-    state = {"obstacle_velocity": np.tile([0, 0.4, 0], (2, 1, 1))}
+@pytest.mark.parametrize(("speed", "left"), [(0.4, 0.0), (2.0, 0.1 - 0.2 / 3)])
+def test_it_can_withdraw_before_what_comes_is_there(speed, left):
+    """A joint can withdraw at 0.2 rad in a step, and a third of that counts.
+
+    Seen from where it then is, it comes nearer by x in this step, x - brake in the next and so on,
+    and the obstacle by what is left, until all the room is gone.
+    """
+    state = {"obstacle_velocity": np.tile([0, speed, 0], (2, 1, 1))}
     turned = shielded(Wall(0.15), state=state, rate=1e3, acceleration=20).joints
-    brake = 20 * 0.05**2 / 3
-    steps = turned / brake
-    np.testing.assert_allclose(turned * (steps + 1) / 2 + 0.02 * (steps + 1), 0.13)
+    x, brake = turned + speed * 0.05 - left, 20 * 0.05**2 / 3
+    np.testing.assert_allclose((x / 2 + left) * (x / brake + 1), 0.13)
 
 
 def test_what_turns_comes_nearer():
@@ -118,7 +122,7 @@ def test_the_reach_is_more_than_the_margin_of_the_table():
 def test_each_shape_may_use_up_what_its_nearest_pair_may():
     zero, room = np.zeros((1, 2)), np.full((1, 2), 0.02)
     fingers, other = np.zeros((1, 2, 0)), np.array([0, 0])
-    then = _Pairs(room, zero, zero, zero[..., None], fingers, zero, other)
+    then = _Pairs(room, zero, zero, zero, zero[..., None], fingers, zero, other)
     np.testing.assert_allclose(_needed(np.array([[0.01, 0.05]]), then), [[-0.01, -0.01]])
 
 

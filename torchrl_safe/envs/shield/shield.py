@@ -52,6 +52,8 @@ class _Pairs(NamedTuple):
     spare: Array
     #: By how much the obstacle will shrink it in the next step, m, ``(k, r)``; not negative.
     closing: Array
+    #: What of that is left if the arm withdraws as fast as it surely can, m, ``(k, r)``.
+    comes: Array
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
     joints: Array
     fingers: Array
@@ -68,6 +70,8 @@ class _Step(NamedTuple):
     simulator: Simulator
     #: s.
     duration: float
+    #: How far the joints can turn in it, rad, ``(n,)``.
+    longest: Array
     #: Of what is left of a distance, the share that may be used up.
     share: float
 
@@ -95,12 +99,13 @@ class Shield:
 
     .. math::
         s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\
-        \sqrt{(b / 2 + c)^2 + 2 b\, (r - c)} - b / 2\right), \qquad
+        \sqrt{(b / 2 + c')^2 + 2 b\, (r - c')} - b / 2\right), \qquad
         b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
 
-    The first part is a share of the room. The second leaves enough room to stop, while the obstacle
-    comes nearer by c in each step, if the arm comes nearer by b less in each following step; b is a
-    third of what all joints together can do. Inside the margin, where r is negative,
+    The first part is a share of the room. The second leaves enough room to stop, or to withdraw as
+    fast as the obstacle comes, if the distance shrinks by b less in each following step; b is a
+    third of what all joints together can do. What a third of their speed does not withdraw from is
+    c', the rest of c. Inside the margin, where r is negative,
     :math:`s = (1 - e^{-\text{rate} \cdot T}) r` makes the arm move away.
 
     The bounds l and u keep joint targets within limits and speeds, and within what motors can
@@ -227,7 +232,8 @@ class Shield:
         """
         angles, held = state.joint_position, state.finger_position
         opening = fingers - held if fingers.shape[1] else np.zeros_like(held)
-        step = _Step(state, simulator, duration, 1 - np.exp(-self.rate * duration))
+        share = 1 - np.exp(-self.rate * duration)
+        step = _Step(state, simulator, duration, longest, share)
         near = self._measure(step, np.arange(len(angles)), angles, held)
         pressed = self._is_pressed(state, near)
         now = self._with_tool(step, near, pressed)
@@ -258,7 +264,7 @@ class Shield:
             both = np.isfinite(near.room[again] + then.room)
             brake = self._brake(step, then.lever)
             brake = np.maximum(brake + both * np.minimum(turned - before, 0), _LEAST * brake)
-            spare = self._spare(step, then.room, brake, then.closing)
+            spare = self._spare(step, then.room, brake, then.comes)
             needed = np.maximum(needed, then.closing - spare - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
@@ -310,8 +316,9 @@ class Shield:
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         lever = _lever(joints)
-        spare = self._spare(step, room, self._brake(step, lever), closing)
-        return _Pairs(room, spare, closing, joints, moved, lever, near.other)
+        comes = np.maximum(closing - _SURE * (np.abs(joints) @ step.longest), 0)
+        spare = self._spare(step, room, self._brake(step, lever), comes)
+        return _Pairs(room, spare, closing, comes, joints, moved, lever, near.other)
 
     def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
         """Which arms have less than half of a margin left, ``(N,)``.
@@ -323,13 +330,13 @@ class Shield:
         least = -np.where(table, self.table, self.margin) / 2
         return np.any(now.room < least, axis=1)
 
-    def _spare(self, step: _Step, room: Array, brake: Array, closing: Array | float) -> Array:
+    def _spare(self, step: _Step, room: Array, brake: Array, comes: Array | float) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
         share = step.share * room
-        some = np.where(np.isfinite(room), np.maximum(room - closing, 0), 0.0)
-        # The arm x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
-        # Meanwhile the obstacle x / brake times what it takes in a step, and once more.
-        stops = np.sqrt((brake / 2 + closing) ** 2 + 2 * brake * some) - brake / 2
+        some = np.where(np.isfinite(room), np.maximum(room - comes, 0), 0.0)
+        # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
+        # Meanwhile what comes does so x / brake times, and once more.
+        stops = np.sqrt((brake / 2 + comes) ** 2 + 2 * brake * some) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
 
     def _brake(self, step: _Step, lever: Array) -> Array:
@@ -395,6 +402,7 @@ class Shield:
             room=np.concatenate([near.room, room], axis=1),
             spare=np.concatenate([near.spare, spare], axis=1),
             closing=np.concatenate([near.closing, np.zeros_like(room)], axis=1),
+            comes=np.concatenate([near.comes, np.zeros_like(room)], axis=1),
             joints=np.concatenate([near.joints, joints], axis=1),
             fingers=np.pad(near.fingers, [(0, 0), (0, room.shape[1]), (0, 0)]),
             lever=np.concatenate([near.lever, _lever(joints)], axis=1),
