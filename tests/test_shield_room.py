@@ -5,7 +5,8 @@ import pytest
 from states import make_state
 
 from torchrl_safe.envs import Nearest, Shield
-from torchrl_safe.envs.shield.shield import _needed, _Pairs, _solve
+from torchrl_safe.envs.shield.motion import safe_motion
+from torchrl_safe.envs.shield.shield import _needed, _Pairs
 
 # Share of the room above the margin, 20 / s over 1/20 s.
 SHARE = 1 - np.exp(-1)
@@ -171,7 +172,7 @@ def test_an_arm_that_brakes_misses_what_it_needs_as_little_as_possible():
     rows, least = np.array([[[1.0], [-1.0]]]), np.array([[0.02, 0.01]])
     bounds, comes = np.array([[1.0]]), np.zeros((1, 2), dtype=bool)
     for last, expected in ((-1.0, 0.005), (-0.002, 0.002)):
-        change, solved, braked = _solve(
+        change, solved, braked = safe_motion(
             np.array([[0.5]]), rows, least, np.full((1, 2), last), comes, -bounds, bounds, None
         )
         assert solved.all()

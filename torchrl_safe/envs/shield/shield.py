@@ -12,7 +12,7 @@ from torchrl_safe._checks import check_kind, check_not_negative, check_positive
 from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.rotations import cross
-from torchrl_safe.envs.shield.projection import project
+from torchrl_safe.envs.shield.motion import safe_motion
 from torchrl_safe.envs.state import ArmState, Array
 
 # At the end of a control step another point of a shape may be the nearest, and points move on
@@ -22,9 +22,6 @@ _ERROR = 0.1
 _SHORTEST, _FAR = 1e-3, 1e3
 # Below this, a distance counts as 0, m.
 _TOLERANCE = 1e-9
-# What an arm that brakes comes too near counts as much as this turn of a joint, m/rad. With much
-# less, rows that only differ in it would be nearly dependent.
-_GIVES = 1e-2
 # The share of the joints' braking that a distance counts on: some joints may have to keep turning.
 _SURE = 1 / 3
 # The share of that which is left at least where points move on curves.
@@ -53,7 +50,7 @@ class _Pairs(NamedTuple):
     #: By how much the obstacle will shrink it in the next step, m, ``(k, r)``; not negative.
     closing: Array
     #: What of that is left if the arm withdraws as fast as it surely can, m, ``(k, r)``.
-    comes: Array
+    excess: Array
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
     joints: Array
     fingers: Array
@@ -246,7 +243,9 @@ class Shield:
         last = np.minimum(least, now.closing - now.room)
         comes = now.closing > 0
         along = self._along(step, asked) if self.tool_weight else None
-        change, solved, braked = _solve(asked, now.joints, least, last, comes, lower, upper, along)
+        change, solved, braked = safe_motion(
+            asked, now.joints, least, last, comes, lower, upper, along
+        )
         # Measure the end of the step as well where it could be too near.
         left = near.room - near.closing + (near.joints @ change[:, :, None])[:, :, 0]
         left += by_fingers[:, : left.shape[1]]  # Not the rows of the tool point.
@@ -264,7 +263,7 @@ class Shield:
             both = np.isfinite(near.room[again] + then.room)
             brake = self._brake(step, then.lever)
             brake = np.maximum(brake + both * np.minimum(turned - before, 0), _LEAST * brake)
-            spare = self._spare(step, then.room, brake, then.comes)
+            spare = self._spare(step, then.room, brake, then.excess)
             needed = np.maximum(needed, then.closing - spare - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
@@ -272,7 +271,7 @@ class Shield:
             short = np.flatnonzero((turned < needed - _TOLERANCE).any(axis=1))
             again = again[short]
         if len(again):
-            change[again], solved[again], braked[again] = _solve(
+            change[again], solved[again], braked[again] = safe_motion(
                 asked[again],
                 np.concatenate([now.joints[again], then.joints[short]], axis=1),
                 np.concatenate([least[again], needed[short]], axis=1),
@@ -316,9 +315,9 @@ class Shield:
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         lever = _lever(joints)
-        comes = np.maximum(closing - _SURE * (np.abs(joints) @ step.longest), 0)
-        spare = self._spare(step, room, self._brake(step, lever), comes)
-        return _Pairs(room, spare, closing, comes, joints, moved, lever, near.other)
+        excess = np.maximum(closing - _SURE * (np.abs(joints) @ step.longest), 0)
+        spare = self._spare(step, room, self._brake(step, lever), excess)
+        return _Pairs(room, spare, closing, excess, joints, moved, lever, near.other)
 
     def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
         """Which arms have less than half of a margin left, ``(N,)``.
@@ -330,13 +329,13 @@ class Shield:
         least = -np.where(table, self.table, self.margin) / 2
         return np.any(now.room < least, axis=1)
 
-    def _spare(self, step: _Step, room: Array, brake: Array, comes: Array | float) -> Array:
+    def _spare(self, step: _Step, room: Array, brake: Array, excess: Array | float) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
         share = step.share * room
-        some = np.where(np.isfinite(room), np.maximum(room - comes, 0), 0.0)
+        some = np.where(np.isfinite(room), np.maximum(room - excess, 0), 0.0)
         # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
-        # Meanwhile what comes does so x / brake times, and once more.
-        stops = np.sqrt((brake / 2 + comes) ** 2 + 2 * brake * some) - brake / 2
+        # Meanwhile what cannot be withdrawn from comes x / brake times, and once more.
+        stops = np.sqrt((brake / 2 + excess) ** 2 + 2 * brake * some) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
 
     def _brake(self, step: _Step, lever: Array) -> Array:
@@ -402,7 +401,7 @@ class Shield:
             room=np.concatenate([near.room, room], axis=1),
             spare=np.concatenate([near.spare, spare], axis=1),
             closing=np.concatenate([near.closing, np.zeros_like(room)], axis=1),
-            comes=np.concatenate([near.comes, np.zeros_like(room)], axis=1),
+            excess=np.concatenate([near.excess, np.zeros_like(room)], axis=1),
             joints=np.concatenate([near.joints, joints], axis=1),
             fingers=np.pad(near.fingers, [(0, 0), (0, room.shape[1]), (0, 0)]),
             lever=np.concatenate([near.lever, _lever(joints)], axis=1),
@@ -440,89 +439,3 @@ def _attainable(rows: Array, least: Array, lower: Array, upper: Array) -> Array:
     middle = (rows @ (0.5 * (lower + upper))[:, :, None])[:, :, 0]
     best = middle + (np.abs(rows) @ (0.5 * (upper - lower))[:, :, None])[:, :, 0]
     return np.minimum(least, np.maximum((best + np.maximum(middle, 0)) / 2, 0))
-
-
-def _solve(
-    asked: Array,
-    rows: Array,
-    least: Array,
-    last: Array,
-    comes: NDArray[np.bool_],
-    lower: Array,
-    upper: Array,
-    along: Array | None,
-) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Projects; where there is no solution, brakes.
-
-    Braking means the slowest motion that misses ``least`` as little as possible, and ``last`` not
-    at all. Where there is none either, what ``comes`` may come nearer, as little as possible. The
-    joints may then brake as hard as they can.
-
-    Returns:
-        The solutions, where there is one, and which are not of what was asked for.
-    """
-    change, solved = _give_way(asked, rows, least, lower, upper, along)
-    braked = ~solved
-    some = np.flatnonzero(braked)
-    if len(some):
-        both = np.concatenate([least[some], last[some]], axis=1)
-        change[some], solved[some] = _slowest(
-            np.concatenate([rows[some]] * 2, axis=1),
-            both,
-            np.arange(both.shape[1]) < rows.shape[1],
-            lower[some],
-            upper[some],
-        )
-    some = np.flatnonzero(~solved & comes.any(axis=1))
-    if len(some):
-        change[some], solved[some] = _slowest(
-            rows[some],
-            last[some],
-            comes[some],
-            np.minimum(lower[some], 0),
-            np.maximum(upper[some], 0),
-        )
-    return change, solved, braked
-
-
-def _give_way(
-    asked: Array,
-    rows: Array,
-    least: Array,
-    lower: Array,
-    upper: Array,
-    along: Array | None,
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Projects; with a weight, no joint turns further than the largest turn that is asked for.
-
-    The weight alone would ask some joints for more than their motors can stop in time.
-    """
-    if along is None:
-        return project(asked, rows, least, lower, upper)
-    most = np.abs(asked).max(axis=1, keepdims=True)
-    slow = np.clip(-most, lower, upper), np.clip(most, lower, upper)
-    change, solved = project(asked, rows, least, *slow, along)
-    # To withdraw can need more.
-    some = np.flatnonzero(~solved)
-    if len(some):
-        change[some], solved[some] = project(
-            asked[some], rows[some], least[some], lower[some], upper[some]
-        )
-    return change, solved
-
-
-def _slowest(
-    rows: Array, least: Array, gives: NDArray[np.bool_], lower: Array, upper: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """The slowest motion; that rows which give miss what they ask for counts much more."""
-    # One more unknown: by how much, in units of _GIVES.
-    none = np.zeros((len(rows), 1))
-    missed = np.broadcast_to(_GIVES * gives, least.shape)
-    point, solved = project(
-        np.concatenate([np.clip(0.0, lower, upper), none], axis=1),
-        np.concatenate([rows, missed[:, :, None]], axis=2),
-        least,
-        np.concatenate([lower, none], axis=1),
-        np.concatenate([upper, none + np.inf], axis=1),
-    )
-    return point[:, :-1], solved

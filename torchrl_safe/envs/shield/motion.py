@@ -1,0 +1,99 @@
+"""The joint motion nearest to the one asked for that is safe, or else one that brakes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_safe.envs.shield.projection import project
+from torchrl_safe.envs.state import Array
+
+# What an arm that brakes comes too near counts as much as this turn of a joint, m/rad. With much
+# less, rows that only differ in it would be nearly dependent.
+_GIVES = 1e-2
+
+
+def safe_motion(
+    asked: Array,
+    rows: Array,
+    least: Array,
+    last: Array,
+    comes: NDArray[np.bool_],
+    lower: Array,
+    upper: Array,
+    along: Array | None,
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Projects; where there is no solution, brakes.
+
+    Braking means the slowest motion that misses ``least`` as little as possible, and ``last`` not
+    at all. Where there is none either, what ``comes`` may come nearer, as little as possible. The
+    joints may then brake as hard as they can.
+
+    Returns:
+        The solutions, where there is one, and which are not of what was asked for.
+    """
+    change, solved = _give_way(asked, rows, least, lower, upper, along)
+    braked = ~solved
+    some = np.flatnonzero(braked)
+    if len(some):
+        both = np.concatenate([least[some], last[some]], axis=1)
+        change[some], solved[some] = _slowest(
+            np.concatenate([rows[some]] * 2, axis=1),
+            both,
+            np.arange(both.shape[1]) < rows.shape[1],
+            lower[some],
+            upper[some],
+        )
+    some = np.flatnonzero(~solved & comes.any(axis=1))
+    if len(some):
+        change[some], solved[some] = _slowest(
+            rows[some],
+            last[some],
+            comes[some],
+            np.minimum(lower[some], 0),
+            np.maximum(upper[some], 0),
+        )
+    return change, solved, braked
+
+
+def _give_way(
+    asked: Array,
+    rows: Array,
+    least: Array,
+    lower: Array,
+    upper: Array,
+    along: Array | None,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Projects; with a weight, no joint turns further than the largest turn that is asked for.
+
+    The weight alone would ask some joints for more than their motors can stop in time.
+    """
+    if along is None:
+        return project(asked, rows, least, lower, upper)
+    most = np.abs(asked).max(axis=1, keepdims=True)
+    slow = np.clip(-most, lower, upper), np.clip(most, lower, upper)
+    change, solved = project(asked, rows, least, *slow, along)
+    # To withdraw can need more.
+    some = np.flatnonzero(~solved)
+    if len(some):
+        change[some], solved[some] = project(
+            asked[some], rows[some], least[some], lower[some], upper[some]
+        )
+    return change, solved
+
+
+def _slowest(
+    rows: Array, least: Array, gives: NDArray[np.bool_], lower: Array, upper: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """The slowest motion; that rows which give miss what they ask for counts much more."""
+    # One more unknown: by how much, in units of _GIVES.
+    none = np.zeros((len(rows), 1))
+    missed = np.broadcast_to(_GIVES * gives, least.shape)
+    point, solved = project(
+        np.concatenate([np.clip(0.0, lower, upper), none], axis=1),
+        np.concatenate([rows, missed[:, :, None]], axis=2),
+        least,
+        np.concatenate([lower, none], axis=1),
+        np.concatenate([upper, none + np.inf], axis=1),
+    )
+    return point[:, :-1], solved
