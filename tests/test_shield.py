@@ -347,6 +347,23 @@ def test_a_tool_outside_its_workspace_moves_in(make_env, engine):
     assert region.contains(env.arm_state.ee_position).all()
 
 
+def test_a_tool_far_from_the_walls_moves_as_asked_where_obstacles_may_come(make_env, engine):
+    """A ball beside it could come, but is far away as well."""
+    shield = Shield(workspace=Region((-2, -2, -2), (2, 2, 2)), obstacle_speed=0.5)
+    layout = Places(Sphere(), at=[(-0.4, 0.6, 0.8)])
+    env = make_env(ArmEnv, obstacles=layout, shield=shield, seed=0)
+    env.reset()
+    for action in (*torch.eye(3), *-torch.eye(3)):
+        assert step(env, action)["shield_correction"].item() == 0
+
+
+def test_motors_without_limits(make_env, engine):
+    scene = Scene(motor_limits=False)
+    env = make_env(ArmEnv, obstacles=Scattered(), scene=scene, shield=Shield(), seed=0)
+    env.reset()
+    assert not step(env, torch.tensor([0.0, 0.0, 1.0]))["shield_braked"].item()
+
+
 def test_a_workspace_without_room_is_refused():
     with pytest.raises(ValueError, match=r"workspace must be wider than two margins of 0.02 m"):
         Shield(workspace=Region((0.2, -0.02, 0.1), (0.6, 0.02, 0.4)))

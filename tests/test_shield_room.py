@@ -92,6 +92,13 @@ def test_what_turns_comes_nearer():
     np.testing.assert_allclose(done.joints, SHARE * 0.13 - 2 * 0.2 * 0.05)
 
 
+def test_it_can_stand_before_what_may_come_is_there():
+    """At 2 m/s: the joint turns by x in this step, x - brake in the next and so on."""
+    x = shielded(Wall(0.15), obstacle_speed=2.0, rate=1e3, acceleration=20).joints
+    brake = 20 * 0.05**2 / 3
+    np.testing.assert_allclose((x / 2 + 0.1) * (x / brake + 1), 0.13)
+
+
 def test_the_table_does_not_come():
     done = shielded(Wall(0.15, other=1), obstacle_speed=2.0)
     np.testing.assert_allclose(done.joints, SHARE * 0.13)
@@ -123,7 +130,7 @@ def test_the_reach_is_more_than_the_margin_of_the_table():
 def test_each_shape_may_use_up_what_its_nearest_pair_may():
     zero, room = np.zeros((1, 2)), np.full((1, 2), 0.02)
     fingers, other = np.zeros((1, 2, 0)), np.array([0, 0])
-    then = _Pairs(room, zero, zero, zero, zero[..., None], fingers, zero, other)
+    then = _Pairs(room, zero, zero, zero[..., None], fingers, zero, other)
     np.testing.assert_allclose(_needed(np.array([[0.01, 0.05]]), then), [[-0.01, -0.01]])
 
 
@@ -185,29 +192,48 @@ class Bend:
 
     fingers = 0
 
-    def __init__(self, here, there, gradient):
-        self.here, self.there, self.gradient = here, np.array(there), np.array(gradient)
+    def __init__(self, here, there, gradient, before=0.0):
+        self.here, self.there = np.array(here), np.array(there)
+        self.gradient, self.before = np.array(gradient), np.array(before)
 
     def nearest(self, rows, angles, fingers):
         turned = angles != 0
         distance = np.where(turned, self.there, self.here)
         nothing = np.zeros((*distance.shape, 3))
-        jacobian = (turned * self.gradient)[..., None]
+        jacobian = np.where(turned, self.gradient, self.before)[..., None]
         return Nearest(distance, nothing, nothing, jacobian, np.zeros(len(self.there), int))
 
     def jacobian(self, angles):
         return np.zeros((len(angles), 6, 1))
 
 
-def test_another_step_like_this_has_to_be_safe():
-    """Where it ends there are 5 cm to stop in, with a quarter of a third of 10 rad/s^2.
-
-    It comes nearer only at the end of the step, so that the rest goes into what bends its way.
-    """
-    done = shielded(Bend(0.01, [0.05], [-1.0]), margin=0, table=0, rate=1e3, acceleration=10)
-    brake = 10 * 0.05**2 / 3 / 4
-    stops = np.sqrt(brake**2 / 4 + 2 * brake * 0.05) - brake / 2
+@pytest.mark.parametrize(
+    ("world", "lever", "brake", "room"),
+    [
+        # One distance is new at the end of the step.
+        (Bend([0.01, np.inf], [9.0, 0.05], [0.0, -1.0]), 1.0, 1.0, 0.05),
+        # It shrinks only at the end of the step, so that a quarter is left.
+        (Bend([0.01], [0.05], [-1.0]), 1.0, 0.25, 0.05),
+    ],
+)
+def test_another_step_like_this_has_to_be_safe(world, lever, brake, room):
+    """Slower by a third of 10 rad/s^2."""
+    done = shielded(world, margin=0, table=0, rate=1e3, acceleration=10)
+    brake *= 10 * 0.05**2 / 3
+    stops = np.sqrt(brake**2 / 4 + 2 * brake * room) - brake / 2
     np.testing.assert_allclose(done.joints, stops + brake)
+
+
+def test_what_shrinks_faster_at_the_end_of_a_step_uses_up_braking():
+    """By 2 %; the shield looks at the end because something else is near."""
+    brake = 10 * 0.05**2 / 3
+    asked = np.sqrt(brake**2 / 4 + 2 * brake * 0.15) - brake / 2
+    world = Bend([0.001, 0.15], [0.001, 0.15 - asked], [0.0, -1.02], before=[0.0, -1.0])
+    done = shielded(world, margin=0, table=0, rate=1e3, acceleration=10)
+    left = 1.02 * brake - 0.02 * asked
+    stops = np.sqrt(left**2 / 4 + 2 * left * (0.15 - asked)) - left / 2
+    assert stops + left < 1.02 * asked
+    np.testing.assert_allclose(done.joints, (stops + left) / 1.02)
 
 
 def test_it_brakes_for_what_only_the_end_of_the_step_shows():

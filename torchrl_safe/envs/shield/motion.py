@@ -66,14 +66,14 @@ def _give_way(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Projects; with a weight, no joint turns further than the largest turn that is asked for.
 
-    The weight alone would ask some joints for more than their motors can stop in time.
+    The weight alone would ask some joints for more than their motors can stop in time. Where that
+    has no solution, only joints count, up to their bounds.
     """
     if along is None:
         return project(asked, rows, least, lower, upper)
     most = np.abs(asked).max(axis=1, keepdims=True)
-    slow = np.clip(-most, lower, upper), np.clip(most, lower, upper)
+    slow = np.maximum(lower, -most), np.minimum(upper, most)
     change, solved = project(asked, rows, least, *slow, along)
-    # To withdraw can need more.
     some = np.flatnonzero(~solved)
     if len(some):
         change[some], solved[some] = project(

@@ -18,14 +18,14 @@ from torchrl_safe.envs.state import ArmState, Array
 # At the end of a control step another point of a shape may be the nearest, and points move on
 # curves. For each radian that the joints turn, a distance can be off by this much, m.
 _ERROR = 0.1
-# For what the joints hardly move, m/rad, and for joints without limits, rad.
+# For what the joints hardly move, m/rad, and for joints without limits of angle or speed, rad.
 _SHORTEST, _FAR = 1e-3, 1e3
 # Below this, a distance counts as 0, m.
 _TOLERANCE = 1e-9
 # The share of the joints' braking that a distance counts on: some joints may have to keep turning.
 _SURE = 1 / 3
 # The share of that which is left at least where points move on curves.
-_LEAST = 1 / 4
+_KEPT = 1 / 4
 
 
 class Shielded(NamedTuple):
@@ -49,8 +49,6 @@ class _Pairs(NamedTuple):
     spare: Array
     #: By how much the obstacle will shrink it in the next step, m, ``(k, r)``; not negative.
     closing: Array
-    #: What of that is left if the arm withdraws as fast as it surely can, m, ``(k, r)``.
-    excess: Array
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
     joints: Array
     fingers: Array
@@ -89,14 +87,14 @@ class Shield:
     J is the Jacobian of the tool point, the unit vector t is where w would move it, and
     :math:`\kappa` is ``tool_weight``. If it is not 0, joints that can give way without slowing the
     tool down do so: a hand turns to pass an obstacle. The tool may move aside. No joint then turns
-    further than the largest turn that was asked for, unless the arm has to withdraw. T is the
-    duration of the control step, c how far the obstacle comes nearer in it, and s a control barrier
-    function in discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and Sreenath 2017, RSS),
-    with which the arm can always stop:
+    further than the largest turn that was asked for. Where that has no solution, only joints count.
+    T is the duration of the control step, c how far the obstacle comes nearer in it, and s a
+    control barrier function in discrete time (Ames et al. 2019, arXiv 1903.11199; Agrawal and
+    Sreenath 2017, RSS), with which the arm can always stop:
 
     .. math::
         s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\
-        \sqrt{(b / 2 + c')^2 + 2 b\, (r - c')} - b / 2\right), \qquad
+        \sqrt{(b / 2 + c')^2 + 2 b \max(r - c', 0)} - b / 2\right), \qquad
         b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
 
     The first part is a share of the room. The second leaves enough room to stop, or to withdraw as
@@ -112,8 +110,8 @@ class Shield:
 
     The problem treats distances as linear, which is not exact. Where the end of the step could be
     too near, the shield measures the distances there as well and solves a second problem with them.
-    In it, one more step like this one, slower by b, has to be safe too. What points on curves
-    approach faster at the end than now is taken off this b, which keeps at least a quarter.
+    In it, one more step like this one, slower by b, has to be safe too. If distances shrink faster
+    at the end of the step than now, b is less by the difference, but at least a quarter of it.
 
     If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
     motion that exceeds s as little as possible, and uses up no more than all the room. If there is
@@ -234,7 +232,7 @@ class Shield:
         near = self._measure(step, np.arange(len(angles)), angles, held)
         pressed = self._is_pressed(state, near)
         now = self._with_tool(step, near, pressed)
-        lower, upper = self._bounds(step, now, longest)
+        lower, upper = self._bounds(step, now)
         asked = np.clip(np.where(pressed[:, None], 0.0, joints - angles), lower, upper)
         by_fingers = (now.fingers @ opening[:, :, None])[:, :, 0]
         least = self._least(step, now) - by_fingers
@@ -258,12 +256,13 @@ class Shield:
                 for joints in (near.joints[again], then.joints)
             )
             needed = _needed((near.room - near.spare)[again], then) + turned
-            # One more step like this one, slowed as far as possible, has to be safe there. Braking
-            # also makes up for what distances shrink faster at the end, as points move on curves.
-            both = np.isfinite(near.room[again] + then.room)
+            # One more step like this one, slowed as far as possible, has to be safe there. Where
+            # points move on curves, distances can shrink faster then: that uses up some braking.
+            seen = np.isfinite(near.room[again] + then.room)
             brake = self._brake(step, then.lever)
-            brake = np.maximum(brake + both * np.minimum(turned - before, 0), _LEAST * brake)
-            spare = self._spare(step, then.room, brake, then.excess)
+            brake = np.maximum(brake + seen * np.minimum(turned - before, 0), _KEPT * brake)
+            excess = _excess(step, then.joints, then.closing)
+            spare = self._spare(step, then.room, brake, excess)
             needed = np.maximum(needed, then.closing - spare - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
@@ -315,9 +314,9 @@ class Shield:
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         lever = _lever(joints)
-        excess = np.maximum(closing - _SURE * (np.abs(joints) @ step.longest), 0)
+        excess = _excess(step, joints, closing)
         spare = self._spare(step, room, self._brake(step, lever), excess)
-        return _Pairs(room, spare, closing, excess, joints, moved, lever, near.other)
+        return _Pairs(room, spare, closing, joints, moved, lever, near.other)
 
     def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
         """Which arms have less than half of a margin left, ``(N,)``.
@@ -333,8 +332,8 @@ class Shield:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
         share = step.share * room
         some = np.where(np.isfinite(room), np.maximum(room - excess, 0), 0.0)
-        # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
-        # Meanwhile what cannot be withdrawn from comes x / brake times, and once more.
+        # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all. Until
+        # then the obstacle comes nearer by the excess in each of x / brake + 1 steps.
         stops = np.sqrt((brake / 2 + excess) ** 2 + 2 * brake * some) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
 
@@ -347,14 +346,15 @@ class Shield:
         least = now.closing - now.spare
         if self.obstacle_speed is None:
             return least
-        moves = now.other < step.state.obstacle_position.shape[1]
-        come = step.duration * self.obstacle_speed * moves
+        # The arm only has to stand when they arrive.
+        come = step.duration * self.obstacle_speed
         spare = self._spare(step, now.room, self._brake(step, now.lever), come)
-        return np.maximum(least, np.minimum(come - spare, 0))
+        stands = np.maximum(least, np.minimum(come - spare, 0))
+        return np.where(now.other < step.state.obstacle_position.shape[1], stands, least)
 
-    def _bounds(self, step: _Step, now: _Pairs, longest: Array) -> tuple[Array, Array]:
+    def _bounds(self, step: _Step, now: _Pairs) -> tuple[Array, Array]:
         """How far the joints may turn, rad, each ``(N, n)``."""
-        state = step.state
+        state, longest = step.state, step.longest
         angles, turning = state.joint_position, state.joint_velocity * step.duration
         lower = np.clip(state.joint_lower - angles, -longest, longest)
         upper = np.clip(state.joint_upper - angles, -longest, longest)
@@ -401,7 +401,6 @@ class Shield:
             room=np.concatenate([near.room, room], axis=1),
             spare=np.concatenate([near.spare, spare], axis=1),
             closing=np.concatenate([near.closing, np.zeros_like(room)], axis=1),
-            excess=np.concatenate([near.excess, np.zeros_like(room)], axis=1),
             joints=np.concatenate([near.joints, joints], axis=1),
             fingers=np.pad(near.fingers, [(0, 0), (0, room.shape[1]), (0, 0)]),
             lever=np.concatenate([near.lever, _lever(joints)], axis=1),
@@ -413,6 +412,12 @@ def _lever(joints: Array) -> Array:
     """By how much all joints together can change a distance, m/rad, ``(k, r)``."""
     lever: Array = np.abs(joints) @ np.ones(joints.shape[2])  # Twice as fast as sum().
     return lever
+
+
+def _excess(step: _Step, joints: Array, closing: Array) -> Array:
+    """What of ``closing`` is left if the arm withdraws as fast as it surely can, m, ``(k, r)``."""
+    withdraws: Array = np.abs(joints) @ np.minimum(step.longest, _FAR)
+    return np.maximum(closing - _SURE * withdraws, 0)
 
 
 def _needed(kept: Array, then: _Pairs) -> Array:
