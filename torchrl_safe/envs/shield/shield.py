@@ -262,7 +262,7 @@ class Shield:
             brake = self._brake(step, then.lever)
             brake = np.maximum(brake + seen * np.minimum(turned - before, 0), _KEPT * brake)
             excess = _excess(step, then.joints, then.closing)
-            spare = self._spare(step, then.room, brake, excess)
+            spare = self._spare(step, then.room - then.closing, brake, excess)
             needed = np.maximum(needed, then.closing - spare - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
