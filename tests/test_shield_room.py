@@ -199,9 +199,10 @@ class Bend:
     def nearest(self, rows, angles, fingers):
         turned = angles != 0
         distance = np.where(turned, self.there, self.here)
-        nothing = np.zeros((*distance.shape, 3))
+        point = np.zeros((*distance.shape, 3))
         jacobian = np.where(turned, self.gradient, self.before)[..., None]
-        return Nearest(distance, nothing, nothing, jacobian, np.zeros(len(self.there), int))
+        other = np.zeros(len(self.there), int)
+        return Nearest(distance, point + (0, 1, 0), point, jacobian, other)
 
     def jacobian(self, angles):
         return np.zeros((len(angles), 6, 1))
@@ -222,6 +223,16 @@ def test_another_step_like_this_has_to_be_safe(world, lever, brake, room):
     brake *= 10 * 0.05**2 / 3
     stops = np.sqrt(brake**2 / 4 + 2 * brake * room) - brake / 2
     np.testing.assert_allclose(done.joints, stops + brake)
+
+
+def test_the_end_of_a_step_counts_what_comes_twice():
+    """In this step, at 0.4 m/s, and in the next: a quarter of the braking is left, as above."""
+    state = {"obstacle_velocity": np.tile([0, 0.4, 0], (2, 1, 1))}
+    world = Bend([0.03], [0.06], [-1.0])
+    done = shielded(world, state=state, margin=0, table=0, rate=1e3, acceleration=10)
+    brake = 10 * 0.05**2 / 3 / 4
+    stops = np.sqrt(brake**2 / 4 + 2 * brake * (0.06 - 0.02)) - brake / 2
+    np.testing.assert_allclose(done.joints, stops + brake - 0.02)
 
 
 def test_what_shrinks_faster_at_the_end_of_a_step_uses_up_braking():
