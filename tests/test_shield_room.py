@@ -202,7 +202,8 @@ class Bend:
         point = np.zeros((*distance.shape, 3))
         jacobian = np.where(turned, self.gradient, self.before)[..., None]
         other = np.zeros(len(self.there), int)
-        return Nearest(distance, point + (0, 1, 0), point, jacobian, other)
+        normal = point + np.array([0, 1, 0])
+        return Nearest(distance, normal, point, jacobian, other)
 
     def jacobian(self, angles):
         return np.zeros((len(angles), 6, 1))
