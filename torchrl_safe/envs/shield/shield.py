@@ -18,7 +18,7 @@ from torchrl_safe.envs.state import ArmState, Array
 # At the end of a control step another point of a shape may be the nearest, and points move on
 # curves. For each radian that the joints turn, a distance can be off by this much, m.
 _ERROR = 0.1
-# For what the joints hardly move, m/rad, and for joints without limits of angle or speed, rad.
+# For what the joints hardly move, m/rad, and for joints without limits, rad.
 _SHORTEST, _FAR = 1e-3, 1e3
 # Below this, a distance counts as 0, m.
 _TOLERANCE = 1e-9
@@ -94,13 +94,12 @@ class Shield:
 
     .. math::
         s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\
-        \sqrt{(b / 2 + c')^2 + 2 b \max(r - c', 0)} - b / 2\right), \qquad
+        \sqrt{(b / 2 + c)^2 + 2 b \max(r - c, 0)} - b / 2\right), \qquad
         b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
 
-    The first part is a share of the room. The second leaves enough room to stop, or to withdraw as
-    fast as the obstacle comes, if the distance shrinks by b less in each following step; b is a
-    third of what all joints together can do. What a third of their speed does not withdraw from is
-    c', the rest of c. Inside the margin, where r is negative,
+    The first part is a share of the room. The second leaves enough room for the arm to stop, if it
+    moves by b less in each following step while the obstacle keeps coming; b is a third of what all
+    joints together can do. Inside the margin, where r is negative,
     :math:`s = (1 - e^{-\text{rate} \cdot T}) r` makes the arm move away.
 
     The bounds l and u keep joint targets within limits and speeds, and within what motors can
@@ -261,8 +260,7 @@ class Shield:
             seen = np.isfinite(near.room[again] + then.room)
             brake = self._brake(step, then.lever)
             brake = np.maximum(brake + seen * np.minimum(turned - before, 0), _KEPT * brake)
-            excess = _excess(step, then.joints, then.closing)
-            spare = self._spare(step, then.room - then.closing, brake, excess)
+            spare = self._spare(step, then.room - then.closing, brake, then.closing)
             needed = np.maximum(needed, then.closing - spare - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
@@ -314,8 +312,7 @@ class Shield:
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
         lever = _lever(joints)
-        excess = _excess(step, joints, closing)
-        spare = self._spare(step, room, self._brake(step, lever), excess)
+        spare = self._spare(step, room, self._brake(step, lever), closing)
         return _Pairs(room, spare, closing, joints, moved, lever, near.other)
 
     def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
@@ -328,13 +325,13 @@ class Shield:
         least = -np.where(table, self.table, self.margin) / 2
         return np.any(now.room < least, axis=1)
 
-    def _spare(self, step: _Step, room: Array, brake: Array, excess: Array | float) -> Array:
+    def _spare(self, step: _Step, room: Array, brake: Array, closing: Array | float) -> Array:
         """How much of the room may be used up in a step, m, ``(k, r)``."""
         share = step.share * room
-        some = np.where(np.isfinite(room), np.maximum(room - excess, 0), 0.0)
-        # x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all. Until
-        # then the obstacle comes nearer by the excess in each of x / brake + 1 steps.
-        stops = np.sqrt((brake / 2 + excess) ** 2 + 2 * brake * some) - brake / 2
+        some = np.where(np.isfinite(room), np.maximum(room - closing, 0), 0.0)
+        # The arm x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
+        # Until then the obstacle keeps coming, in x / brake + 1 steps.
+        stops = np.sqrt((brake / 2 + closing) ** 2 + 2 * brake * some) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
 
     def _brake(self, step: _Step, lever: Array) -> Array:
@@ -346,11 +343,10 @@ class Shield:
         least = now.closing - now.spare
         if self.obstacle_speed is None:
             return least
-        # The arm only has to stand when they arrive.
         come = step.duration * self.obstacle_speed
         spare = self._spare(step, now.room, self._brake(step, now.lever), come)
-        stands = np.maximum(least, np.minimum(come - spare, 0))
-        return np.where(now.other < step.state.obstacle_position.shape[1], stands, least)
+        stops = np.maximum(least, np.minimum(come - spare, 0))
+        return np.where(now.other < step.state.obstacle_position.shape[1], stops, least)
 
     def _bounds(self, step: _Step, now: _Pairs) -> tuple[Array, Array]:
         """How far the joints may turn, rad, each ``(N, n)``."""
@@ -412,12 +408,6 @@ def _lever(joints: Array) -> Array:
     """By how much all joints together can change a distance, m/rad, ``(k, r)``."""
     lever: Array = np.abs(joints) @ np.ones(joints.shape[2])  # Twice as fast as sum().
     return lever
-
-
-def _excess(step: _Step, joints: Array, closing: Array) -> Array:
-    """What of ``closing`` is left if the arm withdraws as fast as it surely can, m, ``(k, r)``."""
-    withdraws: Array = np.abs(joints) @ np.minimum(step.longest, _FAR)
-    return np.maximum(closing - _SURE * withdraws, 0)
 
 
 def _needed(kept: Array, then: _Pairs) -> Array:
