@@ -57,8 +57,8 @@ COSTS: dict[str, Cost] = {
     # Actions ask for up to 1 m/s along each axis.
     "speed": Speed(limit=1.0),
 }
-# Of a hand that reaches as far and as fast as Human's, 0.6 m in 0.7 s, with minimum jerk, m/s^2.
-_HAND = 7.0
+# For a hand that reaches as far and as fast as Human's, 0.6 m in 0.7 s, with minimum jerk.
+_BESIDE_A_PERSON = {"obstacle_acceleration": 7.0, "margin": 0.015}
 
 
 def make_env(
@@ -91,7 +91,7 @@ def make_env(
         arguments = arm_arguments(config, shielded)
         shield = ALGORITHMS[algorithm].shield if shielded else None
         if shield is not None and isinstance(arguments["obstacles"], Human):
-            shield = replace(shield, obstacle_acceleration=_HAND)
+            shield = replace(shield, **_BESIDE_A_PERSON)
         env = ArmEnv(physics=PHYSICS[config.physics], shield=shield, **{**arguments, **settings})
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = ALGORITHMS[algorithm].transforms(config)
