@@ -58,7 +58,7 @@ COSTS: dict[str, Cost] = {
     "speed": Speed(limit=1.0),
 }
 # For a hand that reaches as far and as fast as Human's, 0.6 m in 0.7 s, with minimum jerk.
-_BESIDE_A_PERSON = {"obstacle_acceleration": 7.0, "margin": 0.015}
+_BESIDE_A_PERSON: dict[str, Any] = {"obstacle_acceleration": 7.0, "margin": 0.015}
 
 
 def make_env(
