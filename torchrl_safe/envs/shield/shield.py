@@ -93,9 +93,9 @@ class Shield:
     Sreenath 2017, RSS), with which the arm can always stop:
 
     .. math::
-        s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,\
-        \sqrt{(b / 2 + c)^2 + 2 b \max(r - c, 0)} - b / 2\right), \qquad
-        b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
+        s(r) = \min\left((1 - e^{-\text{rate} \cdot T})\, r,
+        \sqrt{(b / 2 + c)^2 + 2 b \max(r - c, 0)} - b / 2\right),
+        \qquad b = \tfrac13\, \text{acceleration} \cdot T^2\, |\nabla d|_1
 
     The first part is a share of the room. The second leaves enough room for the arm to stop, if it
     moves by b less in each following step while the obstacle keeps coming; b is a third of what all
