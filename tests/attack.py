@@ -180,7 +180,9 @@ def main():
     parser.add_argument(
         "--obstacle-acceleration", type=float, default=0.0, help="that the shield expects, m/s^2"
     )
-    parser.add_argument("--tool-weight", type=float, default=10.0, help="of the shield, rad/m")
+    parser.add_argument(
+        "--tool-weight", type=float, default=Shield.tool_weight, help="of the shield, rad/m"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/attack.json"), help="what is done")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -67,8 +67,9 @@ def project(
         point[open_], solved[open_] = _active_set(target, *_unit(rows, least))
         return point, solved
     # With y = (1 + k k^T)^(1/2) x, the distance between y is the one that counts.
-    outer = along[open_, :, None] * along[open_, None]
-    length = np.sqrt(1 + np.einsum("kn,kn->k", along[open_], along[open_]))[:, None, None]
+    along = along[open_]
+    outer = along[:, :, None] * along[:, None]
+    length = np.sqrt(1 + np.einsum("kn,kn->k", along, along))[:, None, None]
     root = np.eye(wanted.shape[1]) + outer / (1 + length)
     back = np.eye(wanted.shape[1]) - outer / (length + length**2)
     target = (root @ target[:, :, None])[:, :, 0]

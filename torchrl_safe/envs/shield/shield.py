@@ -45,8 +45,6 @@ class _Pairs(NamedTuple):
 
     #: Distance above the margin, m, ``(k, r)``; infinite where there is no pair.
     room: Array
-    #: How much of that may be used up in the step, m, ``(k, r)``; negative where it has to grow.
-    spare: Array
     #: By how much the obstacle will shrink it in the next step, m, ``(k, r)``; not negative.
     closing: Array
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
@@ -65,8 +63,6 @@ class _Step(NamedTuple):
     simulator: Simulator
     #: s.
     duration: float
-    #: How far the joints can turn in it, rad, ``(n,)``.
-    longest: Array
     #: Of what is left of a distance, the share that may be used up.
     share: float
 
@@ -226,15 +222,15 @@ class Shield:
         """
         angles, held = state.joint_position, state.finger_position
         opening = fingers - held if fingers.shape[1] else np.zeros_like(held)
-        share = 1 - np.exp(-self.rate * duration)
-        step = _Step(state, simulator, duration, longest, share)
+        step = _Step(state, simulator, duration, 1 - np.exp(-self.rate * duration))
         near = self._measure(step, np.arange(len(angles)), angles, held)
         pressed = self._is_pressed(state, near)
-        now = self._with_tool(step, near, pressed)
-        lower, upper = self._bounds(step, now)
+        spare = self._spare(step, near.room, self._brake(step, near.lever), near.closing)
+        now, now_spare = self._with_tool(step, near, spare, pressed)
+        lower, upper = self._bounds(step, now, longest)
         asked = np.clip(np.where(pressed[:, None], 0.0, joints - angles), lower, upper)
         by_fingers = (now.fingers @ opening[:, :, None])[:, :, 0]
-        least = self._least(step, now) - by_fingers
+        least = self._least(step, now, now_spare) - by_fingers
         least = _attainable(now.joints, least, lower, upper)
         # If nothing leaves enough room to stop, take what stops above the margin.
         last = np.minimum(least, now.closing - now.room)
@@ -254,14 +250,14 @@ class Shield:
                 (joints @ change[again][:, :, None])[:, :, 0]
                 for joints in (near.joints[again], then.joints)
             )
-            needed = _needed((near.room - near.spare)[again], then) + turned
+            needed = _needed((near.room - spare)[again], then) + turned
             # One more step like this one, slowed as far as possible, has to be safe there. Where
             # points move on curves, distances can shrink faster then: that uses up some braking.
             seen = np.isfinite(near.room[again] + then.room)
             brake = self._brake(step, then.lever)
             brake = np.maximum(brake + seen * np.minimum(turned - before, 0), _KEPT * brake)
-            spare = self._spare(step, then.room - then.closing, brake, then.closing)
-            needed = np.maximum(needed, then.closing - spare - brake)
+            then_spare = self._spare(step, then.room - then.closing, brake, then.closing)
+            needed = np.maximum(needed, then.closing - then_spare - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
             # What satisfies these too is the solution of both.
@@ -311,9 +307,7 @@ class Shield:
             # An obstacle that goes away may stop at any time.
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
-        lever = _lever(joints)
-        spare = self._spare(step, room, self._brake(step, lever), closing)
-        return _Pairs(room, spare, closing, joints, moved, lever, near.other)
+        return _Pairs(room, closing, joints, moved, _lever(joints), near.other)
 
     def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
         """Which arms have less than half of a margin left, ``(N,)``.
@@ -326,7 +320,10 @@ class Shield:
         return np.any(now.room < least, axis=1)
 
     def _spare(self, step: _Step, room: Array, brake: Array, closing: Array | float) -> Array:
-        """How much of the room may be used up in a step, m, ``(k, r)``."""
+        """How much of the room may be used up in a step, m, ``(k, r)``.
+
+        Negative where it has to grow.
+        """
         share = step.share * room
         some = np.where(np.isfinite(room), np.maximum(room - closing, 0), 0.0)
         # The arm x in this step, x - brake in the next and so on: x**2 / (2 brake) + x / 2 in all.
@@ -338,9 +335,9 @@ class Shield:
         """How much less distances can shrink in a step than in the one before, m, ``(k, r)``."""
         return self.acceleration * step.duration**2 * _SURE * lever
 
-    def _least(self, step: _Step, now: _Pairs) -> Array:
+    def _least(self, step: _Step, now: _Pairs, spare: Array) -> Array:
         """By how much each distance has to change at least, m, ``(N, r)``."""
-        least = now.closing - now.spare
+        least = now.closing - spare
         if self.obstacle_speed is None:
             return least
         come = step.duration * self.obstacle_speed
@@ -348,9 +345,9 @@ class Shield:
         stops = np.maximum(least, np.minimum(come - spare, 0))
         return np.where(now.other < step.state.obstacle_position.shape[1], stops, least)
 
-    def _bounds(self, step: _Step, now: _Pairs) -> tuple[Array, Array]:
+    def _bounds(self, step: _Step, now: _Pairs, longest: Array) -> tuple[Array, Array]:
         """How far the joints may turn, rad, each ``(N, n)``."""
-        state, longest = step.state, step.longest
+        state = step.state
         angles, turning = state.joint_position, state.joint_velocity * step.duration
         lower = np.clip(state.joint_lower - angles, -longest, longest)
         upper = np.clip(state.joint_upper - angles, -longest, longest)
@@ -372,15 +369,17 @@ class Shield:
         way = np.divide(way, length, out=np.zeros_like(way), where=length > _TOLERANCE)
         return self.tool_weight * (way[:, None] @ linear)[:, 0]
 
-    def _with_tool(self, step: _Step, near: _Pairs, pressed: NDArray[np.bool_]) -> _Pairs:
-        """Adds what holds for the tool point.
+    def _with_tool(
+        self, step: _Step, near: _Pairs, near_spare: Array, pressed: NDArray[np.bool_]
+    ) -> tuple[_Pairs, Array]:
+        """Adds what holds for the tool point, also to how much of the room may be used up.
 
         It keeps away from the walls of the workspace. That of a pressed arm does not go down: it
         may be on an object, which the shield does not see and whose friction would hold the arm.
         """
         walls = self.workspace
         if walls is None and not pressed.any():
-            return near
+            return near, near_spare
         linear = step.simulator.jacobian(step.state.joint_position)[:, :3]
         joints = linear[:, 2:]
         room, spare = np.full((2, len(pressed), 1), np.inf)
@@ -393,15 +392,15 @@ class Shield:
             spare = np.concatenate([spare, self._spare(step, left, brake, 0.0)], axis=1)
             joints = np.concatenate([joints, ways], axis=1)
         number = step.state.obstacle_position.shape[1] + 1
-        return _Pairs(
+        now = _Pairs(
             room=np.concatenate([near.room, room], axis=1),
-            spare=np.concatenate([near.spare, spare], axis=1),
             closing=np.concatenate([near.closing, np.zeros_like(room)], axis=1),
             joints=np.concatenate([near.joints, joints], axis=1),
             fingers=np.pad(near.fingers, [(0, 0), (0, room.shape[1]), (0, 0)]),
             lever=np.concatenate([near.lever, _lever(joints)], axis=1),
             other=np.append(near.other, np.full(room.shape[1], number)),
         )
+        return now, np.concatenate([near_spare, spare], axis=1)
 
 
 def _lever(joints: Array) -> Array:
