@@ -50,11 +50,11 @@ def test_two_flags_of_a_step_do_not_share_their_memory(make_env, engine):
 
 def test_the_batch_holds_the_sampled_action(make_env, engine):
     """And its log-probability. What is executed instead is up to the environment."""
-    env = make_env(ArmEnv, num_envs=2, action=JointDelta(), shield=Shield(), seed=0)
+    env = make_env(ArmEnv, num_envs=2, shield=Shield(), seed=0)
     sampled = []
 
     def policy(tensordict):
-        action = torch.ones(2, 7) * (-1.0) ** torch.arange(7)
+        action = DOWN.repeat(2, 1)
         sampled.append(action)
         return tensordict.set("action", action)
 

@@ -150,7 +150,7 @@ def cornered(distance, asked, **settings):
     zero, limits = np.zeros((2, 2)), np.full(2, 9.0)
     joints = dict.fromkeys(("joint_position", "joint_velocity"), zero)
     state = make_state(**joints, joint_lower=-limits, joint_upper=limits)
-    shield = Shield(acceleration=1e4, **settings)
+    shield = Shield(**{"acceleration": 1e4, **settings})
     longest = np.full(2, 0.2)
     world = Corner(distance)
     return shield(zero + asked, zero[:, :0], state, world, longest=longest, duration=0.05)
@@ -160,6 +160,23 @@ def test_joints_that_move_the_tool_where_it_is_to_go_give_way_less():
     """With the weight k the first gives way 1 / (1 + k^2) times as much as the second."""
     done = cornered(0.05, (0.1, 0.15), margin=0, table=0, rate=1e3, tool_weight=3.0)
     np.testing.assert_allclose(done.joints, [[0.1 - 0.2 / 11, 0.15 - 0.2 * 10 / 11]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("asked", "change"),
+    [
+        # Of the first, 0.0125 rad are sure and 0.0875 are not: as many as 0.025 m lets it miss.
+        ((-0.1, 0.0), (-0.0125 - 0.025, 0.0)),
+        # Equal wishes have equal parts.
+        ((-0.1, 0.1), (-0.0125 - 0.0125, 0.0125 + 0.0125)),
+        # There is room for these.
+        ((-0.03, 0.0), (-0.03, 0.0)),
+    ],
+)
+def test_what_joints_may_miss_uses_up_no_more_than_half_of_the_room(asked, change):
+    """Motors change velocities by 5 rad/s^2 for sure, 0.0125 rad, and by more perhaps."""
+    done = cornered(0.05, asked, margin=0, table=0, rate=1e3, acceleration=5.0, tool_weight=0.0)
+    np.testing.assert_allclose(done.joints, [change] * 2)
 
 
 def test_a_pressed_arm_takes_the_shortest_way_out():
@@ -221,11 +238,14 @@ def test_another_step_like_this_has_to_be_safe(world, brake):
     np.testing.assert_allclose(done.joints, stops + brake)
 
 
-def test_the_end_of_a_step_counts_what_comes_twice():
+@pytest.mark.parametrize(
+    "comes",
+    [{"state": {"obstacle_velocity": np.tile([0, 0.4, 0], (2, 1, 1))}}, {"obstacle_speed": 0.4}],
+)
+def test_the_end_of_a_step_counts_what_comes_twice(comes):
     """In this step, at 0.4 m/s, and in the next: a quarter of the braking is left, as above."""
-    state = {"obstacle_velocity": np.tile([0, 0.4, 0], (2, 1, 1))}
-    world = Bend([0.03], [0.06], [-1.0])
-    done = shielded(world, state=state, margin=0, table=0, rate=1e3, acceleration=10)
+    world = Bend([0.015], [0.06], [-1.0])
+    done = shielded(world, margin=0, table=0, rate=1e3, acceleration=10, **comes)
     brake = 10 * 0.05**2 / 3 / 4
     stops = np.sqrt((brake / 2 + 0.02) ** 2 + 2 * brake * (0.06 - 2 * 0.02)) - brake / 2
     np.testing.assert_allclose(done.joints, stops + brake - 0.02)

@@ -18,8 +18,8 @@ from torchrl_safe.envs.state import ArmState, Array
 # At the end of a control step another point of a shape may be the nearest, and points move on
 # curves. For each radian that the joints turn, a distance can be off by this much, m.
 _ERROR = 0.1
-# For what the joints hardly move, m/rad, and for joints without limits, rad.
-_SHORTEST, _FAR = 1e-3, 1e3
+# For joints without limits, rad.
+_FAR = 1e3
 # Below this, a distance counts as 0, m.
 _TOLERANCE = 1e-9
 # The share of the joints' braking that a distance counts on: some joints may have to keep turning.
@@ -99,9 +99,10 @@ class Shield:
     :math:`s = (1 - e^{-\text{rate} \cdot T}) r` makes the arm move away.
 
     The bounds l and u keep joint targets within limits and speeds, and within what motors can
-    follow. What is asked for is clipped to them first. A joint's velocity changes by no more than
-    ``acceleration`` allows, or by what takes up the remaining room, whichever is more. Far from
-    everything the shield therefore changes nothing.
+    follow. What is asked for is clipped to them first. A joint's velocity changes by what
+    ``acceleration`` allows. It changes by more where no more than half of a distance would be used
+    up if the motors missed all of the rest; the joints' parts of the rest are in proportion to what
+    is asked for. Far from everything the shield therefore changes nothing.
 
     The problem treats distances as linear, which is not exact. Where the end of the step could be
     too near, the shield measures the distances there as well and solves a second problem with them.
@@ -225,13 +226,13 @@ class Shield:
         step = _Step(state, simulator, duration, 1 - np.exp(-self.rate * duration))
         near = self._measure(step, np.arange(len(angles)), angles, held)
         pressed = self._is_pressed(state, near)
-        spare = self._spare(step, near.room, self._brake(step, near.lever), near.closing)
-        now, now_spare = self._with_tool(step, near, spare, pressed)
-        lower, upper = self._bounds(step, now, longest)
-        asked = np.clip(np.where(pressed[:, None], 0.0, joints - angles), lower, upper)
+        away = self._away(step, near, self._brake(step, near.lever))
+        now, least = self._with_tool(step, near, away, pressed)
+        asked = np.where(pressed[:, None], 0.0, joints - angles)
+        lower, upper = self._bounds(step, now, asked, longest)
+        asked = np.clip(asked, lower, upper)
         by_fingers = (now.fingers @ opening[:, :, None])[:, :, 0]
-        least = self._least(step, now, now_spare) - by_fingers
-        least = _attainable(now.joints, least, lower, upper)
+        least = _attainable(now.joints, least - by_fingers, lower, upper)
         # If nothing leaves enough room to stop, take what stops above the margin.
         last = np.minimum(least, now.closing - now.room)
         comes = now.closing > 0
@@ -240,24 +241,22 @@ class Shield:
             asked, now.joints, least, last, comes, lower, upper, along
         )
         # Measure the end of the step as well where it could be too near.
-        left = near.room - near.closing + (near.joints @ change[:, :, None])[:, :, 0]
+        moved = (near.joints @ change[:, :, None])[:, :, 0]
+        left = near.room - near.closing + moved
         left += by_fingers[:, : left.shape[1]]  # Not the rows of the tool point.
         doubt = left.min(axis=1, initial=np.inf) < _ERROR * np.abs(change).sum(axis=1)
         again = np.flatnonzero(solved & doubt)
         if len(again):
             then = self._measure(step, again, (angles + change)[again], (held + opening)[again])
-            before, turned = (
-                (joints @ change[again][:, :, None])[:, :, 0]
-                for joints in (near.joints[again], then.joints)
-            )
-            needed = _needed((near.room - spare)[again], then) + turned
+            turned = (then.joints @ change[again][:, :, None])[:, :, 0]
+            kept = (near.room - near.closing + away)[again]
+            needed = _needed(kept, then) + turned
             # One more step like this one, slowed as far as possible, has to be safe there. Where
             # points move on curves, distances can shrink faster then: that uses up some braking.
             seen = np.isfinite(near.room[again] + then.room)
             brake = self._brake(step, then.lever)
-            brake = np.maximum(brake + seen * np.minimum(turned - before, 0), _KEPT * brake)
-            then_spare = self._spare(step, then.room - then.closing, brake, then.closing)
-            needed = np.maximum(needed, then.closing - then_spare - brake)
+            brake = np.maximum(brake + seen * np.minimum(turned - moved[again], 0), _KEPT * brake)
+            needed = np.maximum(needed, self._away(step, then, brake, ahead=1) - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
             most = np.minimum(needed, then.closing - then.room + turned)
             # What satisfies these too is the solution of both.
@@ -335,27 +334,43 @@ class Shield:
         """How much less distances can shrink in a step than in the one before, m, ``(k, r)``."""
         return self.acceleration * step.duration**2 * _SURE * lever
 
-    def _least(self, step: _Step, now: _Pairs, spare: Array) -> Array:
-        """By how much each distance has to change at least, m, ``(N, r)``."""
-        least = now.closing - spare
+    def _away(self, step: _Step, pairs: _Pairs, brake: Array, ahead: int = 0) -> Array:
+        """By how much the arm has to change each distance at least in a step, m, ``(k, r)``.
+
+        Negative where it may come nearer.
+
+        Args:
+            step: the control step.
+            pairs: what is near the arm.
+            brake: see :meth:`_brake`.
+            ahead: how many steps later. What comes is nearer by then.
+        """
+
+        def away(closing: Array | float) -> Array:
+            return closing - self._spare(step, pairs.room - ahead * closing, brake, closing)
+
+        least = away(pairs.closing)
         if self.obstacle_speed is None:
             return least
-        come = step.duration * self.obstacle_speed
-        spare = self._spare(step, now.room, self._brake(step, now.lever), come)
-        stops = np.maximum(least, np.minimum(come - spare, 0))
-        return np.where(now.other < step.state.obstacle_position.shape[1], stops, least)
+        stops = np.minimum(away(step.duration * self.obstacle_speed), 0)
+        table = step.state.obstacle_position.shape[1]
+        return np.where(pairs.other < table, np.maximum(least, stops), least)
 
-    def _bounds(self, step: _Step, now: _Pairs, longest: Array) -> tuple[Array, Array]:
+    def _bounds(
+        self, step: _Step, now: _Pairs, asked: Array, longest: Array
+    ) -> tuple[Array, Array]:
         """How far the joints may turn, rad, each ``(N, n)``."""
         state = step.state
         angles, turning = state.joint_position, state.joint_velocity * step.duration
         lower = np.clip(state.joint_lower - angles, -longest, longest)
         upper = np.clip(state.joint_upper - angles, -longest, longest)
-        # A joint misses its target by less than its velocity was to change.
-        # So all together change no distance by more than is left of it.
-        lever = np.maximum(now.lever, _SHORTEST)
-        slack = (np.maximum(now.room, 0) / lever).min(axis=1, initial=np.inf)
-        slack = np.maximum(slack, self.acceleration * step.duration**2)[:, None]
+        # Motors change velocities by this for sure, and perhaps miss the rest. Of that each joint
+        # gets a share with which all together would use up no more than half of a distance.
+        sure = self.acceleration * step.duration**2
+        rest = np.maximum(np.abs(np.clip(asked, lower, upper) - turning) - sure, 0)
+        missed = np.maximum((np.abs(now.joints) @ rest[:, :, None])[:, :, 0], _TOLERANCE)
+        share = (np.maximum(now.room, 0) / (2 * missed)).min(axis=1, initial=_FAR)
+        slack = sure + share[:, None] * rest
         return (
             np.clip(turning - slack, np.maximum(lower, -_FAR), upper),
             np.clip(turning + slack, lower, np.minimum(upper, _FAR)),
@@ -370,26 +385,25 @@ class Shield:
         return self.tool_weight * (way[:, None] @ linear)[:, 0]
 
     def _with_tool(
-        self, step: _Step, near: _Pairs, near_spare: Array, pressed: NDArray[np.bool_]
+        self, step: _Step, near: _Pairs, away: Array, pressed: NDArray[np.bool_]
     ) -> tuple[_Pairs, Array]:
-        """Adds what holds for the tool point, also to how much of the room may be used up.
+        """Adds what holds for the tool point, also to what :meth:`_away` returns.
 
         It keeps away from the walls of the workspace. That of a pressed arm does not go down: it
         may be on an object, which the shield does not see and whose friction would hold the arm.
         """
         walls = self.workspace
         if walls is None and not pressed.any():
-            return near, near_spare
+            return near, away
         linear = step.simulator.jacobian(step.state.joint_position)[:, :3]
         joints = linear[:, 2:]
-        room, spare = np.full((2, len(pressed), 1), np.inf)
-        spare[pressed] = 0
+        room, least = np.full((len(pressed), 1), np.inf), np.where(pressed[:, None], 0.0, -np.inf)
         if walls is not None:
             tool, ways = step.state.ee_position, np.concatenate([linear, -linear], axis=1)
             left = np.concatenate([tool - walls.low, walls.high - tool], axis=1) - self.margin
             room = np.concatenate([room, left], axis=1)
-            brake = self._brake(step, _lever(ways))
-            spare = np.concatenate([spare, self._spare(step, left, brake, 0.0)], axis=1)
+            spare = self._spare(step, left, self._brake(step, _lever(ways)), 0.0)
+            least = np.concatenate([least, -spare], axis=1)
             joints = np.concatenate([joints, ways], axis=1)
         number = step.state.obstacle_position.shape[1] + 1
         now = _Pairs(
@@ -400,7 +414,7 @@ class Shield:
             lever=np.concatenate([near.lever, _lever(joints)], axis=1),
             other=np.append(near.other, np.full(room.shape[1], number)),
         )
-        return now, np.concatenate([near_spare, spare], axis=1)
+        return now, np.concatenate([away, least], axis=1)
 
 
 def _lever(joints: Array) -> Array:
