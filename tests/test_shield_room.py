@@ -186,17 +186,35 @@ def test_a_pressed_arm_takes_the_shortest_way_out():
     np.testing.assert_allclose(done.joints, -SHARE * 0.015 / 2)
 
 
-def test_an_arm_that_brakes_misses_what_it_needs_as_little_as_possible():
-    """One row asks for at least 0.02 rad, the other for at most -0.01: it is as far from both."""
-    rows, least = np.array([[[1.0], [-1.0]]]), np.array([[0.02, 0.01]])
-    bounds, comes = np.array([[1.0]]), np.zeros((1, 2), dtype=bool)
-    for last, expected in ((-1.0, 0.005), (-0.002, 0.002)):
-        change, solved, braked = safe_motion(
-            np.array([[0.5]]), rows, least, np.full((1, 2), last), comes, -bounds, bounds, None
-        )
-        assert solved.all()
-        assert braked.all()
-        np.testing.assert_allclose(change, [[expected]], atol=1e-6)
+@pytest.mark.parametrize(
+    ("last", "share"), [((-1.0, -1.0), 0.03 / 2.03), ((-0.2, 0.0), 0.03 / 0.23)]
+)
+def test_distances_give_way_by_the_same_share_while_an_arm_brakes(last, share):
+    """One asks for at least 0.02 rad, the other for at most -0.01, and the third is far away."""
+    rows, least = np.array([[[1.0], [-1.0], [0.0]]]), np.array([[0.02, 0.01, 0.0]])
+    bounds, comes = np.array([[1.0]]), np.zeros((1, 3), dtype=bool)
+    change, solved, braked = safe_motion(
+        np.array([[0.5]]), rows, least, np.array([[*last, -np.inf]]), comes, -bounds, bounds, None
+    )
+    assert solved.all()
+    assert braked.all()
+    np.testing.assert_allclose(change, [[0.02 - share * (0.02 - last[0])]], atol=1e-6)
+
+
+def test_an_arm_stands_still_where_more_than_the_last_would_be_missed():
+    rows, bounds = np.array([[[1.0], [-1.0]]]), np.array([[1.0]])
+    _, solved, braked = safe_motion(
+        np.zeros((1, 1)),
+        rows,
+        np.array([[0.02, 0.01]]),
+        np.array([[0.02, 0.0]]),
+        np.zeros((1, 2), dtype=bool),
+        -bounds,
+        bounds,
+        None,
+    )
+    assert not solved.any()
+    assert braked.all()
 
 
 class Bend:

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from torchrl_safe.envs.shield.projection import project
 from torchrl_safe.envs.state import Array
 
-# What an arm that brakes comes too near counts as much as this turn of a joint, m/rad. With much
-# less, rows that only differ in it would be nearly dependent.
-_GIVES = 1e-2
+# To use up all room counts as much as this turn of a joint, rad, and where there is none, a metre
+# as much as this, rad/m. With much more, rows that only differ in it would be nearly dependent.
+_ALL, _NONE = 3.0, 100.0
 
 
 def safe_motion(
@@ -25,9 +25,10 @@ def safe_motion(
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Projects; where there is no solution, brakes.
 
-    Braking means the slowest motion that misses ``least`` as little as possible, and ``last`` not
-    at all. Where there is none either, what ``comes`` may come nearer, as little as possible. The
-    joints may then brake as hard as they can.
+    Braking means a slow motion that misses ``least`` as little as possible, and ``last`` not at
+    all: all rows by the same share of what is between the two, so that what is near does not give
+    way to what is far. Where there is none either, what ``comes`` may come nearer, as little as
+    possible. The joints may then brake as hard as they can.
 
     Returns:
         The solutions, where there is one, and which are not of what was asked for.
@@ -36,20 +37,19 @@ def safe_motion(
     braked = ~solved
     some = np.flatnonzero(braked)
     if len(some):
-        both = np.concatenate([least[some], last[some]], axis=1)
+        # What is out of reach has no last, and holds whatever joints do.
+        most, end = least[some], last[some]
+        between = np.subtract(most, end, out=np.zeros_like(end), where=np.isfinite(end))
         change[some], solved[some] = _slowest(
-            np.concatenate([rows[some]] * 2, axis=1),
-            both,
-            np.arange(both.shape[1]) < rows.shape[1],
-            lower[some],
-            upper[some],
+            rows[some], most, between / _ALL, _ALL, lower[some], upper[some]
         )
     some = np.flatnonzero(~solved & comes.any(axis=1))
     if len(some):
         change[some], solved[some] = _slowest(
             rows[some],
             last[some],
-            comes[some],
+            comes[some] / _NONE,
+            np.inf,
             np.minimum(lower[some], 0),
             np.maximum(upper[some], 0),
         )
@@ -83,17 +83,18 @@ def _give_way(
 
 
 def _slowest(
-    rows: Array, least: Array, gives: NDArray[np.bool_], lower: Array, upper: Array
+    rows: Array, least: Array, gives: Array, most: float, lower: Array, upper: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """The slowest motion; that rows which give miss what they ask for counts much more."""
-    # One more unknown: by how much, in units of _GIVES.
+    """The slowest motion, where rows may give way.
+
+    One more unknown, from 0 to ``most``, says how far: by how many ``gives``, m/rad, ``(k, r)``.
+    """
     none = np.zeros((len(rows), 1))
-    missed = np.broadcast_to(_GIVES * gives, least.shape)
     point, solved = project(
         np.concatenate([np.clip(0.0, lower, upper), none], axis=1),
-        np.concatenate([rows, missed[:, :, None]], axis=2),
+        np.concatenate([rows, gives[:, :, None]], axis=2),
         least,
         np.concatenate([lower, none], axis=1),
-        np.concatenate([upper, none + np.inf], axis=1),
+        np.concatenate([upper, none + most], axis=1),
     )
     return point[:, :-1], solved
