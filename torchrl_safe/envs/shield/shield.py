@@ -109,11 +109,11 @@ class Shield:
     In it, one more step like this one, slower by b, has to be safe too. If distances shrink faster
     at the end of the step than now, b is less by the difference, but at least a quarter of it.
 
-    If there is no solution, the arm brakes and ``shield_braked`` is true. It takes the slowest
-    motion that exceeds s as little as possible, and uses up no more than all the room. If there is
-    none, it stands still, or, if an obstacle comes towards it, gives way as far as fixed obstacles
-    allow. An arm with less than half of a margin left brakes too: it only withdraws, whatever is
-    asked for, and its tool does not go down if it can withdraw otherwise.
+    If there is no solution, the arm brakes and ``shield_braked`` is true. It takes a slow motion
+    that exceeds s as little as possible: each distance by the same share of the room that s leaves.
+    If all of it is not enough, it stands still, or, if an obstacle comes towards it, gives way as
+    far as fixed obstacles allow. An arm with less than half of a margin left brakes too: it only
+    withdraws, whatever is asked for, and its tool does not go down if it can withdraw otherwise.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
