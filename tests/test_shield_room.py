@@ -165,8 +165,9 @@ def test_joints_that_move_the_tool_where_it_is_to_go_give_way_less():
 @pytest.mark.parametrize(
     ("asked", "change"),
     [
-        # Of the first, 0.0125 rad are sure and 0.0875 are not: as many as 0.025 m lets it miss.
-        ((-0.1, 0.0), (-0.0125 - 0.025, 0.0)),
+        # Of the first, 0.0125 rad are sure and 0.0875 are not; of the second, a quarter of what is
+        # sure counts, 0.003125. With the share x both miss 0.090625 x, half of 0.05 m.
+        ((-0.1, 0.0), (-0.0125 - 0.0875 * 0.025 / 0.090625, 0.0)),
         # Equal wishes have equal parts.
         ((-0.1, 0.1), (-0.0125 - 0.0125, 0.0125 + 0.0125)),
         # There is room for these.

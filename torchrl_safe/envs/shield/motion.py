@@ -26,9 +26,10 @@ def safe_motion(
     """Projects; where there is no solution, brakes.
 
     Braking means a slow motion that misses ``least`` as little as possible, and ``last`` not at
-    all: all rows by the same share of what is between the two, so that what is near does not give
-    way to what is far. Where there is none either, what ``comes`` may come nearer, as little as
-    possible. The joints may then brake as hard as they can.
+    all: all rows miss it by the same share of what is between the two, so that what is near does
+    not give way to what is far. Where there is none, ``last`` alone holds. Where there is none
+    either, what ``comes`` may come nearer, as little as possible. The joints may then brake as hard
+    as they can.
 
     Returns:
         The solutions, where there is one, and which are not of what was asked for.
@@ -37,11 +38,19 @@ def safe_motion(
     braked = ~solved
     some = np.flatnonzero(braked)
     if len(some):
-        # What is out of reach has no last, and holds whatever joints do.
         most, end = least[some], last[some]
+        # A row without a last does not give: it does not count in the end.
         between = np.subtract(most, end, out=np.zeros_like(end), where=np.isfinite(end))
         change[some], solved[some] = _slowest(
             rows[some], most, between / _ALL, _ALL, lower[some], upper[some]
+        )
+    # There may still be one: such a row was in the way, or rows that give little were nearly
+    # dependent.
+    some = np.flatnonzero(~solved)
+    if len(some):
+        still = np.clip(0.0, lower[some], upper[some])
+        change[some], solved[some] = project(
+            still, rows[some], last[some], lower[some], upper[some]
         )
     some = np.flatnonzero(~solved & comes.any(axis=1))
     if len(some):
@@ -87,7 +96,8 @@ def _slowest(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """The slowest motion, where rows may give way.
 
-    One more unknown, from 0 to ``most``, says how far: by how many ``gives``, m/rad, ``(k, r)``.
+    There is one more unknown, from 0 to ``most``, rad. Each row is relaxed by it times its
+    ``gives``, m/rad, ``(k, r)``.
     """
     none = np.zeros((len(rows), 1))
     point, solved = project(

@@ -26,6 +26,9 @@ _TOLERANCE = 1e-9
 _SURE = 1 / 3
 # The share of that which is left at least where points move on curves.
 _KEPT = 1 / 4
+# Joints that are asked for nothing may have to give way, and for that change their velocities by
+# more than is sure: by at least this much of it where there is room.
+_AT_LEAST = 1 / 4
 
 
 class Shielded(NamedTuple):
@@ -100,9 +103,9 @@ class Shield:
 
     The bounds l and u keep joint targets within limits and speeds, and within what motors can
     follow. What is asked for is clipped to them first. A joint's velocity changes by what
-    ``acceleration`` allows. It changes by more where no more than half of a distance would be used
-    up if the motors missed all of the rest; the joints' parts of the rest are in proportion to what
-    is asked for. Far from everything the shield therefore changes nothing.
+    ``acceleration`` allows. Motors may miss what is asked for beyond that, so it is scaled: missing
+    all of it would use up no more than half of any room. Far from everything the shield therefore
+    changes nothing.
 
     The problem treats distances as linear, which is not exact. Where the end of the step could be
     too near, the shield measures the distances there as well and solves a second problem with them.
@@ -110,10 +113,11 @@ class Shield:
     at the end of the step than now, b is less by the difference, but at least a quarter of it.
 
     If there is no solution, the arm brakes and ``shield_braked`` is true. It takes a slow motion
-    that exceeds s as little as possible: each distance by the same share of the room that s leaves.
-    If all of it is not enough, it stands still, or, if an obstacle comes towards it, gives way as
-    far as fixed obstacles allow. An arm with less than half of a margin left brakes too: it only
-    withdraws, whatever is asked for, and its tool does not go down if it can withdraw otherwise.
+    that exceeds s as little as possible, and uses up no more than all the room: each distance gives
+    up the same share of the room that s would leave it. If there is none, it stands still, or, if
+    an obstacle comes towards it, gives way as far as fixed obstacles allow. An arm with less than
+    half of a margin left brakes too: it only withdraws, whatever is asked for, and its tool does
+    not go down if it can withdraw otherwise.
 
     **What it guarantees.** Fixed obstacles and the table are never touched, if
 
@@ -364,12 +368,13 @@ class Shield:
         angles, turning = state.joint_position, state.joint_velocity * step.duration
         lower = np.clip(state.joint_lower - angles, -longest, longest)
         upper = np.clip(state.joint_upper - angles, -longest, longest)
-        # Motors change velocities by this for sure, and perhaps miss the rest. Of that each joint
-        # gets a share with which all together would use up no more than half of a distance.
+        # Motors change velocities by this for sure, and perhaps miss the rest. That is scaled: all
+        # joints together would use up no more than half of any room if they missed it.
         sure = self.acceleration * step.duration**2
-        rest = np.maximum(np.abs(np.clip(asked, lower, upper) - turning) - sure, 0)
+        change = np.abs(np.clip(asked, lower, upper) - turning)
+        rest = np.maximum(change - sure, _AT_LEAST * sure)
         missed = np.maximum((np.abs(now.joints) @ rest[:, :, None])[:, :, 0], _TOLERANCE)
-        share = (np.maximum(now.room, 0) / (2 * missed)).min(axis=1, initial=_FAR)
+        share = (np.maximum(now.room, 0) / (2 * missed)).min(axis=1, initial=np.inf)
         slack = sure + share[:, None] * rest
         return (
             np.clip(turning - slack, np.maximum(lower, -_FAR), upper),
