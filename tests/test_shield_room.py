@@ -13,10 +13,14 @@ SHARE = 1 - np.exp(-1)
 
 
 class Wall:
-    """A joint, and fingers, that take as much off one distance as they move."""
+    """A joint, and fingers, that take as much off one distance as they move.
 
-    def __init__(self, distance, *, other=0, fingers=0):
+    The joint lifts the tool by ``lift``, m/rad.
+    """
+
+    def __init__(self, distance, *, other=0, fingers=0, lift=0.0):
         self.distance, self.other, self.fingers = distance, np.array([other]), fingers
+        self.lift = lift
 
     def nearest(self, rows, angles, fingers):
         ones = np.ones((len(rows), 1, 3))
@@ -26,7 +30,7 @@ class Wall:
         return Nearest(self.distance - moved, ones * (0, 1, 0), point, jacobian, self.other)
 
     def jacobian(self, angles):
-        return np.zeros((len(angles), 6, 1))
+        return np.tile([[0.0], [0.0], [self.lift], [0.0], [0.0], [0.0]], (len(angles), 1, 1))
 
 
 def shielded(world, asked=0.2, fingers=0.0, state=None, **settings):
@@ -94,6 +98,13 @@ def test_it_can_stop_before_what_may_come_is_there():
     np.testing.assert_allclose((x / 2 + 0.1) * (x / brake + 1), 0.13)
 
 
+def test_what_may_come_is_not_fled_from():
+    """At 2 m/s it could be there within the step."""
+    done = shielded(Wall(0.05), asked=0.0, obstacle_speed=2.0)
+    np.testing.assert_array_equal(done.joints, 0)
+    assert not done.braked.any()
+
+
 def test_the_table_does_not_come():
     done = shielded(Wall(0.15, other=1), obstacle_speed=2.0)
     np.testing.assert_allclose(done.joints, SHARE * 0.13)
@@ -146,10 +157,14 @@ class Corner:
         return np.eye(6, 2) * (1, 0) + np.zeros((len(angles), 1, 1))
 
 
-def cornered(distance, asked, **settings):
+def cornered(distance, asked, velocity=None, **settings):
     zero, limits = np.zeros((2, 2)), np.full(2, 9.0)
-    joints = dict.fromkeys(("joint_position", "joint_velocity"), zero)
-    state = make_state(**joints, joint_lower=-limits, joint_upper=limits)
+    state = make_state(
+        joint_position=zero,
+        joint_velocity=zero if velocity is None else velocity,
+        joint_lower=-limits,
+        joint_upper=limits,
+    )
     shield = Shield(**{"acceleration": 1e4, **settings})
     longest = np.full(2, 0.2)
     world = Corner(distance)
@@ -163,20 +178,24 @@ def test_joints_that_move_the_tool_where_it_is_to_go_give_way_less():
 
 
 @pytest.mark.parametrize(
-    ("asked", "change"),
+    ("asked", "velocity", "change"),
     [
         # Of the first, 0.0125 rad are sure and 0.0875 are not; of the second, a quarter of what is
         # sure counts, 0.003125. With the share x both miss 0.090625 x, half of 0.05 m.
-        ((-0.1, 0.0), (-0.0125 - 0.0875 * 0.025 / 0.090625, 0.0)),
+        ((-0.1, 0.0), (0.0, 0.0), (-0.0125 - 0.0875 * 0.025 / 0.090625, 0.0)),
         # Equal wishes have equal parts.
-        ((-0.1, 0.1), (-0.0125 - 0.0125, 0.0125 + 0.0125)),
+        ((-0.1, 0.1), (0.0, 0.0), (-0.0125 - 0.0125, 0.0125 + 0.0125)),
         # There is room for these.
-        ((-0.03, 0.0), (-0.03, 0.0)),
+        ((-0.03, 0.0), (0.0, 0.0), (-0.03, 0.0)),
+        ((-0.1, 0.0), (-2.0, 0.0), (-0.1, 0.0)),
+        # Joints can turn by 0.2 rad: more is not asked for.
+        ((-0.5, 0.2), (0.0, 0.0), (-0.0125 - 0.0125, 0.0125 + 0.0125)),
     ],
 )
-def test_what_joints_may_miss_uses_up_no_more_than_half_of_the_room(asked, change):
+def test_what_joints_may_miss_uses_up_no_more_than_half_of_the_room(asked, velocity, change):
     """Motors change velocities by 5 rad/s^2 for sure, 0.0125 rad, and by more perhaps."""
-    done = cornered(0.05, asked, margin=0, table=0, rate=1e3, acceleration=5.0, tool_weight=0.0)
+    settings = {"margin": 0, "table": 0, "rate": 1e3, "acceleration": 5.0, "tool_weight": 0.0}
+    done = cornered(0.05, asked, np.array([velocity, velocity]), **settings)
     np.testing.assert_allclose(done.joints, [change] * 2)
 
 
@@ -185,6 +204,13 @@ def test_a_pressed_arm_takes_the_shortest_way_out():
     done = cornered(0.005, 0.0, tool_weight=10.0)
     assert done.braked.all()
     np.testing.assert_allclose(done.joints, -SHARE * 0.015 / 2)
+
+
+def test_a_pressed_arm_goes_down_where_nothing_else_is_left():
+    """Its one joint turns down or into the obstacle."""
+    done = shielded(Wall(0.005, lift=1.0))
+    assert done.braked.all()
+    np.testing.assert_allclose(done.joints, -SHARE * 0.015)
 
 
 @pytest.mark.parametrize(
@@ -202,20 +228,25 @@ def test_distances_give_way_by_the_same_share_while_an_arm_brakes(last, share):
     np.testing.assert_allclose(change, [[0.02 - share * (0.02 - last[0])]], atol=1e-6)
 
 
-def test_an_arm_stands_still_where_more_than_the_last_would_be_missed():
+@pytest.mark.parametrize(
+    ("least", "last", "found"),
+    [
+        # The first may not be missed, the second by no more than 0.01.
+        ((0.02, 0.01), (0.02, 0.0), False),
+        # They may be missed by fractions of a millimetre.
+        ((0.0001, 0.0001), (-0.0003, -0.0003), True),
+    ],
+)
+def test_an_arm_stands_still_only_where_the_last_would_be_missed(least, last, found):
     rows, bounds = np.array([[[1.0], [-1.0]]]), np.array([[1.0]])
-    _, solved, braked = safe_motion(
-        np.zeros((1, 1)),
-        rows,
-        np.array([[0.02, 0.01]]),
-        np.array([[0.02, 0.0]]),
-        np.zeros((1, 2), dtype=bool),
-        -bounds,
-        bounds,
-        None,
+    comes = np.zeros((1, 2), dtype=bool)
+    change, solved, braked = safe_motion(
+        np.zeros((1, 1)), rows, np.array([least]), np.array([last]), comes, -bounds, bounds, None
     )
-    assert not solved.any()
+    assert solved.all() == found
     assert braked.all()
+    if found:
+        assert ((rows @ change[:, :, None])[:, :, 0] >= last).all()
 
 
 class Bend:
