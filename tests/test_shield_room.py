@@ -136,7 +136,7 @@ def test_the_reach_is_more_than_the_margin_of_the_table():
 def test_each_shape_may_use_up_what_its_nearest_pair_may():
     zero, room = np.zeros((1, 2)), np.full((1, 2), 0.02)
     fingers, other = np.zeros((1, 2, 0)), np.array([0, 0])
-    then = _Pairs(room, zero, zero[..., None], fingers, zero, other)
+    then = _Pairs(room, zero, zero[..., None], fingers, other)
     np.testing.assert_allclose(_needed(np.array([[0.01, 0.05]]), then), [[-0.01, -0.01]])
 
 

@@ -53,8 +53,6 @@ class _Pairs(NamedTuple):
     #: By how much the joints change it, m/rad, ``(k, r, n)``, and the fingers, ``(k, r, f)``.
     joints: Array
     fingers: Array
-    #: By how much all joints together can change it, m/rad, ``(k, r)``.
-    lever: Array
     #: Numbers of the obstacles, then of the table, then of what holds for the tool, ``(r,)``.
     other: NDArray[np.int_]
 
@@ -230,7 +228,7 @@ class Shield:
         step = _Step(state, simulator, duration, 1 - np.exp(-self.rate * duration))
         near = self._measure(step, np.arange(len(angles)), angles, held)
         pressed = self._is_pressed(state, near)
-        away = self._away(step, near, self._brake(step, near.lever))
+        away = self._away(step, near, self._brake(step, near.joints))
         now, least = self._with_tool(step, near, away, pressed)
         asked = np.where(pressed[:, None], 0.0, joints - angles)
         lower, upper = self._bounds(step, now, asked, longest)
@@ -258,7 +256,7 @@ class Shield:
             # One more step like this one, slowed as far as possible, has to be safe there. Where
             # points move on curves, distances can shrink faster then: that uses up some braking.
             seen = np.isfinite(near.room[again] + then.room)
-            brake = self._brake(step, then.lever)
+            brake = self._brake(step, then.joints)
             brake = np.maximum(brake + seen * np.minimum(turned - moved[again], 0), _KEPT * brake)
             needed = np.maximum(needed, self._away(step, then, brake, ahead=1) - brake)
             needed = _attainable(then.joints, needed, lower[again], upper[again])
@@ -310,7 +308,7 @@ class Shield:
             # An obstacle that goes away may stop at any time.
             closing = np.where(near.other < table, np.maximum(speed, 0), 0.0) * step.duration
         joints, moved = near.jacobian[..., :count], near.jacobian[..., count:]
-        return _Pairs(room, closing, joints, moved, _lever(joints), near.other)
+        return _Pairs(room, closing, joints, moved, near.other)
 
     def _is_pressed(self, state: ArmState, now: _Pairs) -> NDArray[np.bool_]:
         """Which arms have less than half of a margin left, ``(N,)``.
@@ -334,8 +332,9 @@ class Shield:
         stops = np.sqrt((brake / 2 + closing) ** 2 + 2 * brake * some) - brake / 2
         return np.where(room > 0, np.minimum(share, stops), share)
 
-    def _brake(self, step: _Step, lever: Array) -> Array:
+    def _brake(self, step: _Step, joints: Array) -> Array:
         """How much less distances can shrink in a step than in the one before, m, ``(k, r)``."""
+        lever: Array = np.abs(joints) @ np.ones(joints.shape[2])  # Twice as fast as sum().
         return self.acceleration * step.duration**2 * _SURE * lever
 
     def _away(self, step: _Step, pairs: _Pairs, brake: Array, ahead: int = 0) -> Array:
@@ -407,7 +406,7 @@ class Shield:
             tool, ways = step.state.ee_position, np.concatenate([linear, -linear], axis=1)
             left = np.concatenate([tool - walls.low, walls.high - tool], axis=1) - self.margin
             room = np.concatenate([room, left], axis=1)
-            spare = self._spare(step, left, self._brake(step, _lever(ways)), 0.0)
+            spare = self._spare(step, left, self._brake(step, ways), 0.0)
             least = np.concatenate([least, -spare], axis=1)
             joints = np.concatenate([joints, ways], axis=1)
         number = step.state.obstacle_position.shape[1] + 1
@@ -416,16 +415,9 @@ class Shield:
             closing=np.concatenate([near.closing, np.zeros_like(room)], axis=1),
             joints=np.concatenate([near.joints, joints], axis=1),
             fingers=np.pad(near.fingers, [(0, 0), (0, room.shape[1]), (0, 0)]),
-            lever=np.concatenate([near.lever, _lever(joints)], axis=1),
             other=np.append(near.other, np.full(room.shape[1], number)),
         )
         return now, np.concatenate([away, least], axis=1)
-
-
-def _lever(joints: Array) -> Array:
-    """By how much all joints together can change a distance, m/rad, ``(k, r)``."""
-    lever: Array = np.abs(joints) @ np.ones(joints.shape[2])  # Twice as fast as sum().
-    return lever
 
 
 def _needed(kept: Array, then: _Pairs) -> Array:
