@@ -87,6 +87,13 @@ def test_the_transforms_need_no_simulator():
 
 
 @pytest.mark.integration
+def test_a_shield_says_what_it_needs():
+    code = "import sys; sys.modules['daqp'] = None; from torchrl_safe.envs import Shield; Shield()"
+    done = run_code(code)
+    assert 'ImportError: Shield needs DAQP: pip install "torchrl-safe[arms]".' in done.stderr
+
+
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("module", "needed"),
     [

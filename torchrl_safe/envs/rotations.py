@@ -8,6 +8,8 @@ from torchrl_safe.envs.state import Array
 
 #: The orientation of what is not turned.
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+# For x, y and z: the axis that follows, and the one before.
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def rotation_vector(current: Array, wanted: Array) -> Array:
@@ -84,11 +86,8 @@ def from_z_axis(axis: Array) -> Array:
 
 def cross(first: Array, second: Array) -> Array:
     """Returns cross products, ``(..., 3)``: for few vectors several times as fast as NumPy's."""
-    x, y, z = first[..., 0], first[..., 1], first[..., 2]
-    other_x, other_y, other_z = second[..., 0], second[..., 1], second[..., 2]
-    return np.stack(
-        [y * other_z - z * other_y, z * other_x - x * other_z, x * other_y - y * other_x], axis=-1
-    )
+    ahead: Array = first.take(_NEXT, axis=-1) * second.take(_LAST, axis=-1)
+    return ahead - first.take(_LAST, axis=-1) * second.take(_NEXT, axis=-1)
 
 
 def turn(orientation: Array, vector: Array) -> Array:

@@ -44,8 +44,7 @@ def safe_motion(
         change[some], solved[some] = _slowest(
             rows[some], most, between / _ALL, _ALL, lower[some], upper[some]
         )
-    # There may still be one: such a row was in the way, or rows that give little were nearly
-    # dependent.
+    # There may still be one: a row that does not give was in the way.
     some = np.flatnonzero(~solved)
     if len(some):
         still = np.clip(0.0, lower[some], upper[some])
