@@ -119,3 +119,14 @@ def test_rows_of_zeros_hold_always_or_never():
     zeros, wide = np.zeros((2, 1, 2)), np.full((2, 2), 9.0)
     _, solved = project(np.ones((2, 2)), zeros, np.array([[-1.0], [1.0]]), -wide, wide)
     assert solved.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("part", [0, 1, 2, 5], ids=["wanted", "rows", "least", "along"])
+def test_what_is_not_a_number_has_no_solution(part):
+    arguments = [*problems(0), np.ones((40, 3))]
+    points, solved = project(*arguments)
+    moved = solved & (points != arguments[0]).any(axis=1)
+    assert moved.any()
+    arguments[part] = arguments[part].copy()
+    arguments[part][moved] = np.nan
+    np.testing.assert_array_equal(project(*arguments)[1], solved & ~moved)
