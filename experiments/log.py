@@ -16,7 +16,7 @@ from torchrl.objectives import LossModule
 from torchrl.record.loggers import get_logger
 
 # What a run uses.
-_PACKAGES = ("torch", "torchrl", "pybullet", "mujoco", "gymnasium", "safety-gymnasium")
+_PACKAGES = ("torch", "torchrl", "pybullet", "mujoco", "daqp", "gymnasium", "safety-gymnasium")
 
 
 class Log:
