@@ -88,15 +88,17 @@ def test_projections_are_the_nearest_points_of_nearly_dependent_rows(apart):
         np.testing.assert_allclose(points[index], nearest, atol=1e-5)
 
 
+@pytest.mark.parametrize("weight", [0.0, 10.0, 1000.0])
 @pytest.mark.parametrize(
     "arguments",
     [problems(0, unknowns=7, rows=12), nearly_dependent(3)],
     ids=["any", "nearly-dependent"],
 )
-def test_projections_know_when_there_is_no_solution(arguments):
+def test_projections_know_when_there_is_no_solution(arguments, weight):
     """Of seven joints, as SciPy's linear programs have it."""
     wanted, rows, least, lower, upper = arguments
-    points, solved = project(wanted, rows, least, lower, upper)
+    along = weight * np.random.default_rng(0).normal(size=wanted.shape)
+    points, solved = project(wanted, rows, least, lower, upper, along)
     for index in range(len(wanted)):
         bounds = list(zip(lower[index], upper[index], strict=True))
         program = linprog(np.zeros(7), -rows[index], -least[index], bounds=bounds)
