@@ -67,7 +67,6 @@ def project(
     linear = -(metric @ wanted[open_, :, None])[:, :, 0]
     lowest = np.concatenate([lower[open_], least[open_]], axis=1)
     highest = np.concatenate([upper[open_], np.full((len(open_), rows.shape[1]), np.inf)], axis=1)
-    kind = np.zeros(lowest.shape[1], dtype=np.int32)  # Inequalities.
     for problem, index in enumerate(open_):
         found, _, flag, _ = daqp.solve(
             metric[problem],
@@ -75,7 +74,6 @@ def project(
             rows[index],
             highest[problem],
             lowest[problem],
-            kind,
             primal_tol=_TOLERANCE,
         )
         point[index], solved[index] = found, flag > 0
