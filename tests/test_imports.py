@@ -88,9 +88,16 @@ def test_the_transforms_need_no_simulator():
 
 @pytest.mark.integration
 def test_a_shield_says_what_it_needs():
-    code = "import sys; sys.modules['daqp'] = None; from torchrl_safe.envs import Shield; Shield()"
+    code = (
+        "import sys; sys.modules['daqp'] = None\n"
+        "from torchrl_safe.envs import ArmEnv, Shield\n"
+        "ArmEnv().close()\n"
+        "print(shield := Shield())\n"
+        "ArmEnv(shield=shield)"
+    )
     done = run_code(code)
-    assert 'ImportError: Shield needs DAQP: pip install "torchrl-safe[arms]".' in done.stderr
+    assert "Shield(" in done.stdout
+    assert 'ImportError: A shield needs DAQP: pip install "torchrl-safe[arms]".' in done.stderr
 
 
 @pytest.mark.integration

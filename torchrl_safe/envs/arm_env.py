@@ -31,6 +31,7 @@ from torchrl_safe.envs.physics.bullet import Bullet
 from torchrl_safe.envs.physics.scene import SUBSTEP, Camera, Scene
 from torchrl_safe.envs.physics.simulator import Physics
 from torchrl_safe.envs.shield import Shield
+from torchrl_safe.envs.shield.projection import check_solver
 from torchrl_safe.envs.starts import Starts
 from torchrl_safe.envs.state import ArmState, Array, Sensing, Sensor
 from torchrl_safe.envs.tasks import Reach, Task
@@ -92,6 +93,7 @@ class ArmEnv(EnvBase):
         gui (bool, optional): show the first world in a window. Defaults to ``False``.
 
     Raises:
+        ImportError: if the physics engine is missing or, with a shield, DAQP.
         TypeError: if an argument has the wrong type.
         ValueError: if an argument cannot be used, an action, observation, reward or cost is not
             finite or has the wrong shape, or the obstacles overlap the arm at home.
@@ -140,6 +142,7 @@ class ArmEnv(EnvBase):
         check_kind("physics", physics, Physics, such_as="MuJoCo()")
         if shield is not None:
             check_kind("shield", shield, Shield, such_as="Shield()")
+            check_solver()
         costs = {"collision": Collision()} if costs is None else costs
         check_kind("costs", costs, Mapping, such_as='{"collision": Collision()}')
         if not costs:

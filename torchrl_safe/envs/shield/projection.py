@@ -19,7 +19,7 @@ _TOLERANCE, _ROUNDING = 1e-9, 1e-6
 def check_solver() -> None:
     """Raises an ImportError where DAQP is missing."""
     if daqp is None:
-        raise ImportError('Shield needs DAQP: pip install "torchrl-safe[arms]".')
+        raise ImportError('A shield needs DAQP: pip install "torchrl-safe[arms]".')
 
 
 def project(
@@ -51,11 +51,15 @@ def project(
         The points, ``(N, n)``, and which problems have a solution, ``(N,)``. Where there is
         none, the point has no meaning.
 
+    Raises:
+        ImportError: if DAQP is missing.
+
     Examples:
         >>> wanted, bound = np.array([[-1.0, 1.0]]), np.full((1, 2), 1.5)
         >>> project(wanted, np.array([[[1.0, 0.0]]]), np.zeros((1, 1)), -bound, bound)
         (array([[0., 1.]]), array([ True]))
     """
+    check_solver()
     point = wanted.copy()
     solved = _hold(rows, point, least - _TOLERANCE)
     open_ = np.flatnonzero(~solved)

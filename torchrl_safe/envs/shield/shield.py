@@ -13,7 +13,6 @@ from torchrl_safe.envs.physics.simulator import Simulator
 from torchrl_safe.envs.regions import Region
 from torchrl_safe.envs.rotations import cross
 from torchrl_safe.envs.shield.motion import safe_motion
-from torchrl_safe.envs.shield.projection import check_solver
 from torchrl_safe.envs.state import ArmState, Array
 
 # At the end of a control step another point of a shape may be the nearest, and points move on
@@ -158,7 +157,6 @@ class Shield:
             a joint does, rad/m. With 0, only joints count, and policies lose more return.
 
     Raises:
-        ImportError: if DAQP is missing, which solves the problems.
         TypeError: if ``workspace`` is not a Region.
         ValueError: if a number is negative or not finite, ``reach`` is not larger than both
             margins, or ``workspace`` is not wider than two margins.
@@ -183,7 +181,6 @@ class Shield:
     tool_weight: float = 10.0
 
     def __post_init__(self) -> None:
-        check_solver()
         check_not_negative(
             margin=self.margin,
             table=self.table,
