@@ -43,6 +43,8 @@ class Config:
     """Train in the paper's environment instead of the benchmark."""
     limits: tuple[float, ...] = (10.0, 5.0, 2.0, 1.0, 0.5)
     """Limits of the expected cost of an episode."""
+    limit_share: float = TrainConfig.limit_share
+    """Share of each limit that training aims at."""
     actions: tuple[Action, ...] = ("cartesian", "joint")
     """What an action moves."""
     observation: Observation = "full"
@@ -82,6 +84,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
                 observation=config.observation,
                 physics=config.physics or ("bullet" if config.paper else "mujoco"),
                 cost_limit=limit or 0.0,
+                limit_share=config.limit_share,
                 seed=seed,
                 frames=config.frames,
                 frames_per_batch=config.frames_per_batch,

@@ -45,6 +45,12 @@ def test_engine_is_an_option(script, tmp_path):
         assert {settings.physics for settings, _ in jobs.values()} == {physics}
 
 
+def test_training_may_aim_below_the_limits():
+    config = sweep.Config(limits=(2.0,), limit_share=0.75)
+    aims = {settings.aims["collision"] for settings, _ in sweep.jobs(config).values()}
+    assert aims == {1.5, 0.0}  # PPO has no limit.
+
+
 def test_the_paper_has_one_engine(tmp_path):
     with pytest.raises(ValueError, match="physics must be bullet with paper, got mujoco"):
         sweep.jobs(sweep.Config(paper=True, physics="mujoco", out=tmp_path))
