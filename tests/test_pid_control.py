@@ -251,6 +251,23 @@ def test_the_state_of_another_number_of_costs_is_refused(updater):
 def test_bad_arguments_are_named(name, value):
     with pytest.raises(ValueError, match=rf"^{name} must .* got {value}"):
         make(**{name: value})
+    updater = make()
+    before = getattr(updater, name)
+    with pytest.raises(ValueError, match=rf"^{name} must .* got {value}"):
+        setattr(updater, name, value)
+    assert getattr(updater, name) == before
+
+
+def test_a_gain_that_is_set_later_counts():
+    updater = make(ki=0.5)
+    assert follow(updater, 12.0) == [1]
+    updater.ki = 1.0
+    assert follow(updater, 12.0) == [3]
+
+
+def test_what_the_state_depends_on_cannot_be_set():
+    with pytest.raises(AttributeError):
+        make().normalize = True
 
 
 def test_a_gain_that_would_overflow_is_refused():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar, overload
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +12,9 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_safe import _checks
-from torchrl_safe._checks import as_tensor, check_one_each
+from torchrl_safe._checks import as_tensor, check_count, check_one_each
+
+_T = TypeVar("_T")
 
 # Their squares are neither 0 nor infinite in single precision, in which losses compute.
 SMALLEST, LARGEST = 1e-18, 1e18
@@ -33,6 +36,46 @@ def check_number(name: str, value: Any, least: float = 0.0, most: float = LARGES
     return number
 
 
+def check_fraction(name: str, value: Any, least: float = 0.0) -> float:
+    """Returns the value; raises ValueError unless it is a number from ``least`` to below 1."""
+    number = as_scalar(value)
+    if not least <= number < 1:
+        raise ValueError(f"{name} must be at least {least:g} and less than 1, got {value!r}.")
+    return number
+
+
+def check_whole(name: str, value: Any, least: int = 1) -> int:
+    """Returns the value; raises ValueError unless it is a whole number of at least ``least``."""
+    check_count(least=least, **{name: value})
+    return int(value)
+
+
+class Checked(Generic[_T]):
+    """An attribute that is checked whenever it is set.
+
+    Args:
+        check (callable): takes the name and the value, and returns what to keep or raises.
+    """
+
+    def __init__(self, check: Callable[[str, Any], _T]) -> None:
+        self._check = check
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Checked[_T]: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> _T: ...
+
+    def __get__(self, instance: object | None, owner: type) -> Checked[_T] | _T:
+        return self if instance is None else instance.__dict__[self._name]
+
+    def __set__(self, instance: object, value: Any) -> None:
+        instance.__dict__[self._name] = self._check(self._name, value)
+
+
 def coefficients(name: str, value: Any, num_costs: int, least: float = 0.0) -> Tensor:
     """One number, shape ``()``, or one for each cost, ``(k,)``; see :func:`check_number`."""
     numbers = as_tensor(name, value, torch.get_default_dtype())
@@ -42,9 +85,9 @@ def coefficients(name: str, value: Any, num_costs: int, least: float = 0.0) -> T
     return numbers.clone()
 
 
-def check_episode_length(episode_length: float | None) -> float | None:
+def check_episode_length(name: str, episode_length: float | None) -> float | None:
     """Returns the value; raises ValueError unless it is at least one step, or None."""
-    return None if episode_length is None else check_number("episode_length", episode_length, 1)
+    return None if episode_length is None else check_number(name, episode_length, 1)
 
 
 def check_length_known(episode_length: float | None, gamma: Tensor) -> None:

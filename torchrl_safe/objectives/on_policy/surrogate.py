@@ -71,7 +71,7 @@ class CostSurrogate(ConstrainedPPO):
 
     @episode_length.setter
     def episode_length(self, episode_length: float | None) -> None:
-        length = check_episode_length(episode_length)
+        length = check_episode_length("episode_length", episode_length)
         if self._cost_value_estimator is not None:
             check_length_known(length, self._cost_value_estimator.gamma)
         self._episode_length = length

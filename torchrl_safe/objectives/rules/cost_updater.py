@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_safe._checks import as_tensor, check_names, check_one_each
-from torchrl_safe.objectives._checks import as_scalar, check_number, uncompiled
+from torchrl_safe.objectives._checks import Checked, as_scalar, check_number, uncompiled
 
 #: Which updaters write which buffer of a loss.
 _UPDATERS = {
@@ -35,6 +35,8 @@ class CostUpdater(abc.ABC):
     """
 
     buffer_name: str
+
+    pessimism = Checked(check_number)
 
     def __init__(
         self,
@@ -71,15 +73,6 @@ class CostUpdater(abc.ABC):
     @cost_limit.setter
     def cost_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> None:
         self._cost_limit = self._as_limit(cost_limit)
-
-    @property
-    def pessimism(self) -> float:
-        """Standard errors that are added to the mean cost. You can set it."""
-        return self._pessimism
-
-    @pessimism.setter
-    def pessimism(self, pessimism: float) -> None:
-        self._pessimism = check_number("pessimism", pessimism)
 
     def _as_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> Tensor:
         """The limits, shape ``(k,)``, or an error that says why they cannot be used."""

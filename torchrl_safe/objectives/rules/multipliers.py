@@ -14,13 +14,19 @@ from torch.distributions.transforms import Transform, identity_transform
 from torchrl.objectives import LossModule
 
 from torchrl_safe._checks import check_flag, check_kind
-from torchrl_safe.objectives._checks import SMALLEST, as_scalar, check_number
+from torchrl_safe.objectives._checks import SMALLEST, Checked, as_scalar, check_number
 from torchrl_safe.objectives.rules.cost_updater import CostUpdater
 
 # A relative violation is divided by at least this share of the limit.
 _SHARE_OF_LIMIT = 0.2
 # Share of the scale of violations that each batch forgets.
 _FORGOTTEN = 0.2
+
+
+def _check_bound(name: str, bound: float | None) -> float | None:
+    if bound is None or as_scalar(bound) == math.inf:
+        return bound
+    return check_number(name, bound, SMALLEST)
 
 
 class MultiplierUpdater(CostUpdater):
@@ -75,6 +81,8 @@ class MultiplierUpdater(CostUpdater):
 
     buffer_name = "lagrange_multiplier"
 
+    max_multiplier = Checked(_check_bound)
+
     def __init__(
         self,
         loss_module: LossModule,
@@ -86,7 +94,7 @@ class MultiplierUpdater(CostUpdater):
         cost_names: Sequence[str] | None = None,
     ) -> None:
         check_flag(normalize=normalize)
-        self.normalize = normalize
+        self._normalize = normalize
         super().__init__(
             loss_module, cost_limit=cost_limit, pessimism=pessimism, cost_names=cost_names
         )
@@ -94,18 +102,14 @@ class MultiplierUpdater(CostUpdater):
         # The largest so far, slowly forgotten.
         self.cost_scale = torch.zeros_like(self.cost_limit)
 
+    @property
+    def normalize(self) -> bool:
+        """Whether violations are relative. Fixed once made: the state depends on it."""
+        return self._normalize
+
     def _check_state(self, state_dict: dict[str, Any]) -> None:
         super()._check_state(state_dict)
-        _check_bound(state_dict["max_multiplier"])
-
-    @property
-    def max_multiplier(self) -> float | None:
-        """The largest multiplier, if there is one. You can set what the constructor takes."""
-        return self._max_multiplier
-
-    @max_multiplier.setter
-    def max_multiplier(self, bound: float | None) -> None:
-        self._max_multiplier = _check_bound(bound)
+        _check_bound("max_multiplier", state_dict["max_multiplier"])
 
     def _as_limit(self, cost_limit: float | Tensor | Mapping[str, float]) -> Tensor:
         limit = super()._as_limit(cost_limit)
@@ -182,14 +186,8 @@ class MultiplierUpdater(CostUpdater):
         """
         super().load_state_dict(state_dict)
         self.max_multiplier = state_dict["max_multiplier"]
-        self.normalize = state_dict["normalize"]
+        self._normalize = state_dict["normalize"]
         self.cost_scale = state_dict["cost_scale"].clone()
-
-
-def _check_bound(bound: float | None) -> float | None:
-    if bound is None or as_scalar(bound) == math.inf:
-        return bound
-    return check_number("max_multiplier", bound, SMALLEST)
 
 
 class DualAscent(MultiplierUpdater):

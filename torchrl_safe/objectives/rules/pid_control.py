@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_safe.objectives._checks import as_scalar, check_number
+from torchrl_safe.objectives._checks import Checked, check_fraction, check_number
 from torchrl_safe.objectives.rules.multipliers import MultiplierUpdater
 
 
@@ -108,6 +108,11 @@ class PIDControl(MultiplierUpdater):
         tensor([6.5000])
     """
 
+    kp = Checked(check_number)
+    ki = Checked(check_number)
+    kd = Checked(check_number)
+    smoothing = Checked(check_fraction)
+
     def __init__(
         self,
         loss_module: LossModule,
@@ -130,12 +135,7 @@ class PIDControl(MultiplierUpdater):
             normalize=normalize,
             cost_names=cost_names,
         )
-        self.kp, self.ki, self.kd = (
-            check_number(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd))
-        )
-        if not 0 <= as_scalar(smoothing) < 1:
-            raise ValueError(f"smoothing must be at least 0 and less than 1, got {smoothing!r}.")
-        self.smoothing = as_scalar(smoothing)
+        self.kp, self.ki, self.kd, self.smoothing = kp, ki, kd, smoothing
         multiplier = loss_module.lagrange_multiplier
         self.integral = self._parameter(multiplier).clone()
         # NaN until there has been a batch.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -13,13 +14,15 @@ from torch.nn.parameter import is_lazy
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import PPOLoss
 
-from torchrl_safe._checks import check_count, check_kind
+from torchrl_safe._checks import check_kind
 from torchrl_safe.objectives._checks import (
     SMALLEST,
-    as_scalar,
+    Checked,
     check_episode_length,
+    check_fraction,
     check_length_known,
     check_number,
+    check_whole,
     get_or_raise,
     uncompiled,
 )
@@ -144,6 +147,13 @@ class TrustRegionStep:
         (True, 0)
     """
 
+    episode_length = Checked(check_episode_length)
+    max_kl = Checked(partial(check_number, least=SMALLEST))
+    damping = Checked(check_number)
+    cg_iterations = Checked(check_whole)
+    shrink = Checked(partial(check_fraction, least=SMALLEST))
+    max_backtracks = Checked(partial(check_whole, least=0))
+
     def __init__(
         self,
         loss_module: PPOLoss,
@@ -162,40 +172,18 @@ class TrustRegionStep:
         _check_loss(loss_module, method)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             raise ValueError(f"dtype must be a floating-point torch.dtype, got {dtype!r}.")
-        check_count(cg_iterations=cg_iterations)
-        check_count(max_backtracks=max_backtracks, least=0)
-        if not 0 < as_scalar(shrink) < 1:
-            raise ValueError(f"shrink must be more than 0 and less than 1, got {shrink!r}.")
         self.loss_module = loss_module
         self.method = method
         self.episode_length = episode_length
         self.max_kl = max_kl
-        self.damping = check_number("damping", damping)
+        self.damping = damping
         self.cg_iterations = cg_iterations
-        self.shrink = as_scalar(shrink)
+        self.shrink = shrink
         self.max_backtracks = max_backtracks
         self.dtype = dtype
         self.rejected_steps = 0
         self.indefinite_steps = 0
         self.recovery_steps = 0
-
-    @property
-    def episode_length(self) -> float | None:
-        """Mean number of steps of an episode. You can set what the constructor takes."""
-        return self._episode_length
-
-    @episode_length.setter
-    def episode_length(self, episode_length: float | None) -> None:
-        self._episode_length = check_episode_length(episode_length)
-
-    @property
-    def max_kl(self) -> float:
-        """Bound on the mean divergence of one step, in nats. You can set it."""
-        return self._max_kl
-
-    @max_kl.setter
-    def max_kl(self, max_kl: float) -> None:
-        self._max_kl = check_number("max_kl", max_kl, SMALLEST)
 
     def step(self, tensordict: TensorDictBase) -> TensorDict:
         """Moves the actor once.
