@@ -85,7 +85,7 @@ class Config:
     ] = "ppo-lagrangian"  # fmt: skip
     """What to train with; ppo and trpo know no costs."""
     frames: int = 1_000_000
-    """Steps to train for."""
+    """Steps to train for, rounded up to whole batches."""
     envs: int = 8
     """Environments that step side by side."""
     asynchronous: bool = False

@@ -36,7 +36,8 @@ class Config:
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the runs."""
     frames: int = 500_000
-    """Steps to train for; whole epochs of OmniSafe, 20,000 steps each."""
+    """Steps to train for; whole epochs of OmniSafe, 20,000 steps each. Ours are rounded up to whole
+    batches."""
     cost_limit: float = 25.0
     """Limit of the expected cost of an episode."""
     jobs: int = cores()

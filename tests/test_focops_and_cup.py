@@ -62,6 +62,16 @@ def test_cup_of_an_actor_without_shapes():
     assert loss.projection_loss(data)["kl"] > 0
 
 
+def test_padding_does_not_count_in_what_ends_a_phase_of_cup():
+    loss = build(CUPLoss, 1)
+    data = estimated(loss, 1)
+    kept = torch.arange(len(data)) % 2 == 0
+    expected = loss(data[kept])["kl_approx"]
+    data["collector", "mask"] = kept.unsqueeze(-1)
+    data["action_log_prob"][~kept] = 100.0
+    torch.testing.assert_close(loss(data)["kl_approx"], expected)
+
+
 @pytest.mark.parametrize("functional", [True, False], ids=["functional", "not-functional"])
 def test_cup_projects_by_hand(functional):
     multiplier = torch.tensor([0.5, 0.0, 2.0])

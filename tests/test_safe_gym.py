@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 from counting import Counting, Forgetful, Torque
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torchrl.collectors import Collector
 from torchrl.data import Unbounded
 from torchrl.envs import (
@@ -97,6 +98,20 @@ def test_made_by_gymnasium(make_env, mode):
     )
     env = make_env(SafeGymWrapper, vectorized)
     check_counts(env.rollout(5, break_when_any_done=False), [2, 2, 2])
+
+
+@by_mode
+def test_wrapped_by_gymnasium(make_env, mode):
+    """Wrappers have the mode in their metadata only."""
+    env = make_env(SafeGymWrapper, RecordEpisodeStatistics(vector(mode)))
+    check_counts(env.rollout(9, break_when_any_done=False), [4, 3])
+
+
+def test_an_unknown_mode_is_refused():
+    env = RecordEpisodeStatistics(vector(MODES[0]))
+    env.metadata = {}
+    with pytest.raises(ValueError, match=r"how it resets itself, by metadata\['autoreset_mode'\]"):
+        SafeGymWrapper(env)
 
 
 @pytest.mark.parametrize("asynchronous", [True, False])
@@ -253,19 +268,6 @@ def test_as_many_frames_as_can_be(count):
         SafeGymWrapper(Counting(), frame_skip=count)
 
 
-@pytest.mark.parametrize("many", [False, True], ids=["one", "several"])
-def test_discrete_actions_are_numbered_from_0(many):
-    """TorchRL would send 0, 1 and 2."""
-
-    def make():
-        env = Counting()
-        env.action_space = Discrete(3, start=5)
-        return env
-
-    with pytest.raises(ValueError, match=r"number its actions from 0, got Discrete\(3, start=5\)"):
-        SafeGymWrapper(vector(MODES[0], make) if many else make())
-
-
 def test_frames_of_several_environments_are_not_skipped_together():
     """When one ends, the others would lose their frames."""
     with pytest.raises(ValueError, match=r"frame_skip must be 1 for several environments, .* 4"):
@@ -302,16 +304,32 @@ def test_other_info_can_still_be_read(make_env):
         def info(self):
             return {**super().info(), "twice": np.float64(2 * self.count)}
 
+        def reset(self, **kwargs):
+            observation, info = super().reset(**kwargs)
+            return observation, {**info, "twice": np.float64(-1)}
+
     single = make_env(SafeGymWrapper, Flag(4))
     single.set_info_dict_reader(default_info_dict_reader(["twice"]))
     assert single.rollout(4)["next", "twice"].flatten().tolist() == [2, 4, 6, 8]
-    same_step = make_env(SafeGymWrapper, vector(AutoresetMode.SAME_STEP, partial(Flag, 3), Flag))
+    several = vector(AutoresetMode.SAME_STEP, partial(Flag, 3), Flag)
     # Nobody asked for it, so it is no observation.
-    assert list(same_step.observation_spec.keys()) == ["observation"]
+    assert list(make_env(SafeGymWrapper, several).observation_spec.keys()) == ["observation"]
+    same_step = make_env(SafeGymWrapper, several)
     reader = default_info_dict_reader(["twice"], spec=[Unbounded((2,), dtype=torch.float64)])
     same_step.set_info_dict_reader(reader)
     rollout = same_step.rollout(5, break_when_any_done=False)
     assert rollout["next", "twice"].tolist() == [[2, 4, 6, 2, 4], [2, 4, 6, 8, 2]]
+    assert rollout["twice"].tolist() == [[-1, 2, 4, -1, 2], [-1, 2, 4, 6, -1]]
+
+
+@by_mode
+def test_info_may_have_numbers_for_names(make_env, mode):
+    class Numbered(Counting):
+        def info(self):
+            return {**super().info(), 7: 1.0}
+
+    env = make_env(SafeGymWrapper, vector(mode, Numbered, partial(Numbered, 3)))
+    check_counts(env.rollout(5, break_when_any_done=False), [4, 3])
 
 
 def test_info_may_hold_arrays(make_env):

@@ -47,6 +47,15 @@ def test_it_falls_slowly_and_rises_at_once():
     torch.testing.assert_close(scale, torch.tensor([math.sqrt(162)]))
 
 
+def test_it_falls_under_autocast_too():
+    """In bfloat16 a step of 2 % of a small difference would be rounded away."""
+    scale, cost = torch.ones(1), 0.85 * torch.tensor([[1.0], [-1.0]]).bfloat16() / math.sqrt(2)
+    for _ in range(300):
+        scale = cost_advantage_scale(scale, cost)
+    assert scale.dtype == torch.float32
+    assert scale.item() == pytest.approx(0.85, rel=0.01)
+
+
 def test_steps_that_do_not_count_have_no_share_in_it():
     cost = torch.tensor([[1.0], [1000.0], [5.0], [float("nan")]])
     counted = torch.tensor([[True], [False], [True], [False]])

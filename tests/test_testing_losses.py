@@ -7,7 +7,7 @@ import torch
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 
 from torchrl_safe import testing
-from torchrl_safe.objectives import PPOLagrangianLoss, SACLagrangianLoss
+from torchrl_safe.objectives import PPOLagrangianLoss, SACLagrangianLoss, reduced
 
 
 class Scaled(PPOLagrangianLoss):
@@ -190,6 +190,22 @@ class Halves(PPOLagrangianLoss):
 def test_a_mask_that_is_ignored(make, message):
     with pytest.raises(AssertionError, match=f"{message}, output 'loss_critic'"):
         testing.check_masked_steps(make)
+
+
+class DividesByPadding(PPOLagrangianLoss):
+    """A masked step divides by a stored deviation of 0, and is left out too late."""
+
+    def forward(self, data):
+        losses, critic = super().forward(data), self.critic_network
+        with self.critic_network_params.to_module(critic):
+            ratio = critic(data.select("observation"))["state_value"] / data["scale"]
+        losses["loss_critic"] = losses["loss_critic"] + reduced(self, ratio, data)
+        return losses
+
+
+def test_padding_that_makes_a_gradient_nan():
+    with pytest.raises(AssertionError, match=r"make the gradient of critic_network_params.*NaN"):
+        testing.check_masked_steps(DividesByPadding)
 
 
 class FixedKey(PPOLagrangianLoss):

@@ -431,9 +431,11 @@ def test_a_trainer_that_sees_no_batches(make_arm):
     with pytest.raises(ValueError, match="async_collection must be False"):
         make_arm().safe_trainer(async_collection=True)
     arm = make_arm()
-    arm.collector.set_truncated = True
-    with pytest.raises(ValueError, match="set_truncated of the collector must be False"):
-        arm.safe_trainer()
+    for option in ("set_truncated", "reset_at_each_iter"):
+        setattr(arm.collector, option, True)
+        with pytest.raises(ValueError, match=f"{option} of the collector must be False"):
+            arm.safe_trainer()
+        setattr(arm.collector, option, False)
     hook = MultiplierHook(DualAscent(make_loss(), cost_limit=1.0, lr=0.5))
     with pytest.raises(ValueError, match="collector must yield its batches"):
         hook.log(None)

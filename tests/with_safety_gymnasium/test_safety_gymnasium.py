@@ -20,7 +20,7 @@ from torchrl.envs import ParallelEnv, RewardSum, SerialEnv, TransformedEnv  # no
 from torchrl.envs.libs.safety_gymnasium import SafetyGymnasiumEnv  # noqa: E402
 from torchrl.envs.utils import check_env_specs  # noqa: E402
 
-from torchrl_safe.envs import CostToReward  # noqa: E402
+from torchrl_safe.envs import CostToReward, EarlyTermination  # noqa: E402
 from torchrl_safe.envs.gym import SafeGymEnv, SafeGymWrapper  # noqa: E402
 
 SWIMMER = "SafetySwimmerVelocity-v1"
@@ -141,6 +141,19 @@ def test_vectorized(make_env, forked_workers, make):
     expected = rows(SWIMMER, 3, actions)
     assert expected[3][:, EPISODE - 1 :: EPISODE].sum() > 0, "no last step with a cost"
     check_same(replay(env, 3, actions), expected)
+
+
+def test_early_termination_takes_single_ones(make_env):
+    """Those of Gymnasium 0.28 reset themselves, and cannot be reset when a transform says so."""
+    env = make_env(SafeGymEnv, SWIMMER, num_envs=2, asynchronous=False)
+    early = env.append_transform(EarlyTermination(1))
+    with pytest.raises(RuntimeError, match="put single ones in a SerialEnv or a ParallelEnv"):
+        early.rollout(100, break_when_any_done=False)
+    serial = SerialEnv(2, partial(SafeGymEnv, SWIMMER))
+    early = make_env(TransformedEnv, serial, EarlyTermination(1))
+    rollout = early.rollout(100, break_when_any_done=False)
+    assert rollout["next", "terminated"].any()
+    assert rollout["accumulated_cost"].max() <= 1
 
 
 def test_rows_that_end_apart(make_env):

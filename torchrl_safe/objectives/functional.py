@@ -134,6 +134,8 @@ def cost_advantage_scale(
         values, count = torch.where(counted, values, 0.0), counted.sum(rows)
     # Unbiased, and 0 for a single step.
     current = unit * (values.square().sum(rows) / (count - 1).clamp_min(1)).sqrt()
+    # In half precision small steps would be lost: it would stay where it is.
+    current = current.to(torch.promote_types(past.dtype, current.dtype))
     past = past.to(current)
     scale = torch.maximum(current, past.lerp(current, 1 - memory))
     return torch.where(current.isfinite(), scale, past)  # NaN would never be forgotten.

@@ -114,6 +114,7 @@ def check_masked_steps(
 
     The mask is TorchRL's ``("collector", "mask")``. The values of masked steps must have no effect.
     If the loss draws no random numbers, its outputs must be those of the data without these steps.
+    And where these steps hold zeros, as padding does, every gradient must be finite.
 
     Args:
         make_loss (callable): see :func:`check_equals_at_zero`.
@@ -125,7 +126,7 @@ def check_masked_steps(
         constrain (callable, optional): see :func:`check_equals_at_zero`.
 
     Raises:
-        AssertionError: if a masked step counts.
+        AssertionError: if a masked step counts, or makes a gradient infinite or NaN.
 
     Examples:
         >>> from torchrl_safe.objectives import PPOLagrangianLoss
@@ -153,6 +154,17 @@ def check_masked_steps(
     one, other = run(data, seed=1), run(data, seed=2)
     if all(torch.equal(value, other[key]) for key, value in one.items()):
         require_same_outputs("masked steps count", expected, run(data[kept]), exact=False)
+    padded = masked.clone()
+    for value in padded.values(True, True):
+        if value.is_floating_point():
+            value[~kept] = 0
+    loss = constrained(make_loss, make_networks, num_costs, constrain)
+    total(call(loss, padded)).backward()
+    for name, parameter in loss.named_parameters():
+        require(
+            parameter.grad is None or bool(parameter.grad.isfinite().all()),
+            f"{named(loss)}: zeros in masked steps make the gradient of {name} infinite or NaN",
+        )
 
 
 def check_num_costs(

@@ -35,8 +35,8 @@ class ConstrainedPPOTrainer(PPOTrainer):
             environment repeats actions within a step.
         optim_steps_per_batch (int, optional): steps of the optimizer in an epoch. Defaults to
             ``None``, all minibatches of the replay buffer.
-        gamma (float, optional): discount of reward and costs, with ``lmbda``. Defaults to what
-            ``loss_module`` has.
+        gamma (float, optional): discount of reward and costs, with ``lmbda``: the loss gets new
+            estimators with them, GAE for both. Defaults to what ``loss_module`` has.
         lmbda (float, optional): trace decay of reward and costs, with ``gamma``. Defaults to
             what ``loss_module`` has.
         add_gae (bool, optional): whether advantages are estimated here. Defaults to ``True``.

@@ -159,6 +159,11 @@ class MultiplierHook(TrainerHookBase):
                 "set_truncated of the collector must be False: it cuts episodes at the end of a "
                 "batch, so that they would count with a part of their cost."
             )
+        if getattr(trainer.collector, "reset_at_each_iter", False):
+            raise ValueError(
+                "reset_at_each_iter of the collector must be False: it cuts episodes at the end of "
+                "a batch, and the cost of those would never count."
+            )
         if trainer.learner_backend != "local":
             raise ValueError(
                 f"learner_backend must be 'local', got {trainer.learner_backend!r}: the loss of "

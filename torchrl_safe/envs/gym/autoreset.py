@@ -20,7 +20,26 @@ from packaging.version import Version
 Info = Mapping[str, Any]
 
 _HAS_MODES = Version(gymnasium.__version__) >= Version("1.1")
+#: How to get environments that can be reset one by one.
+SINGLE_RESETS = (
+    "make them with AutoresetMode.DISABLED"
+    if _HAS_MODES
+    else "put single ones in a SerialEnv or a ParallelEnv"
+)
 _LAST_OBSERVATION = "final_obs" if _HAS_MODES else "final_observation"
+
+
+def set_mode(env: Any) -> None:
+    """Gives an environment the attribute that TorchRL reads: wrappers have it in their metadata."""
+    if not _HAS_MODES:
+        return
+    mode = getattr(env, "autoreset_mode", env.metadata.get("autoreset_mode"))
+    if mode is None:
+        raise ValueError(
+            "env must say how it resets itself, by metadata['autoreset_mode'], for example "
+            f"AutoresetMode.DISABLED, got {env}."
+        )
+    env.autoreset_mode = mode
 
 
 def resets_itself(env: Any) -> bool:
@@ -86,7 +105,7 @@ def _are_numbers(values: list[Any]) -> bool:
 def _merge(info: Info, last: Info, done: NDArray[np.bool_]) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     for name in {*info, *last} - {"final_info", _LAST_OBSERVATION}:
-        if name.startswith("_"):
+        if isinstance(name, str) and name.startswith("_"):
             continue
         entry, last_entry = info.get(name), last.get(name)
         if isinstance(entry, Mapping) or isinstance(last_entry, Mapping):

@@ -5,7 +5,7 @@ Import from :mod:`torchrl_safe.envs.gym`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
 from types import SimpleNamespace
@@ -60,6 +60,8 @@ class _CostBesideReward(GymWrapper):
         return "reward"
 
     def _make_specs(self, env: gymnasium.Env) -> None:
+        self._vectorized = self._is_batched
+        _check_spaces(env, vectorized=self._vectorized)
         super()._make_specs(env)
         # For _step: asking an environment for its specs takes longer than encoding a value.
         box = isinstance(self.action_spec, Bounded | Unbounded) and self._convert_actions_to_numpy
@@ -76,17 +78,8 @@ class _CostBesideReward(GymWrapper):
             shape=self.batch_size,
         )
         self._cost = np.zeros(self.full_reward_spec["cost"].shape)
-        # Which environments have reset themselves in the last step, and all their observations.
-        self._started: tuple[NDArray[np.bool_], Any] | None = None
-        self._vectorized = self._is_batched
-        raw = self._env
-        space = raw.single_action_space if self._vectorized else raw.action_space
-        # TorchRL's specs do not know where a Discrete space starts.
-        if isinstance(space, gymnasium.spaces.Discrete) and space.start != 0:
-            raise ValueError(
-                f"env must number its actions from 0, got {space}: wrap it in Gymnasium's "
-                "TransformAction."
-            )
+        # Which environments have reset themselves in the last step, and all observations and info.
+        self._started: tuple[NDArray[np.bool_], Any, Any] | None = None
         if self._vectorized and self.wrapper_frame_skip > 1:
             raise ValueError(
                 "frame_skip must be 1 for several environments, whose episodes end at different "
@@ -127,15 +120,16 @@ class _CostBesideReward(GymWrapper):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         started, self._started = self._started, None
         if started is not None and mask is not None and not kwargs:
-            done, observation = started
+            done, observation, info = started
             if np.array_equal(mask.numpy(force=True).reshape(done.shape), done):
                 source = self.read_obs(observation)
-                return TensorDict(source, self.batch_size, device=self.device)
+                start = TensorDict(source, self.batch_size, device=self.device)
+                return self._with_info(start, info)
         if not self._resets_itself or mask is None or mask.all():
             return super()._reset(tensordict, **kwargs)
         raise RuntimeError(
             "They reset themselves: only environments that are done can be reset apart from the "
-            "others. Where a transform ends episodes, make them with AutoresetMode.DISABLED."
+            f"others. Where a transform ends episodes, {autoreset.SINGLE_RESETS}."
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -159,10 +153,14 @@ class _CostBesideReward(GymWrapper):
         if self._resets_itself:
             # Tells TorchRL's VecGymEnvTransform that nothing is left to be replaced.
             after["final"] = TensorDict(batch_size=self.batch_size)
+        return self._with_info(after, info)
+
+    def _with_info(self, tensordict: TensorDict, info: Any) -> TensorDict:
+        """What the registered readers make of an info, added."""
         for reader in self.info_dict_reader:
-            read = reader(info, after)
-            after = after if read is None else read
-        return after
+            read = reader(info, tensordict)
+            tensordict = tensordict if read is None else read
+        return tensordict
 
     def _action_of(self, tensordict: TensorDictBase) -> Any:
         if self._box_action_key is not None:
@@ -177,7 +175,7 @@ class _CostBesideReward(GymWrapper):
         done = terminated | truncated
         self._started = None
         if self._resets_itself and done.any():
-            self._started = done, observation
+            self._started = done, observation, info
             observation = autoreset.last_observation(self._env, observation, info, done)
             info = autoreset.last_info(info, done)
         for column, path in enumerate(self._cost_paths):
@@ -197,6 +195,38 @@ class _CostBesideReward(GymWrapper):
         if isinstance(value, np.ndarray) and value.dtype == object:
             value = value.tolist()  # Gymnasium puts NumPy's bools and tensors into such an array.
         return check_array(name, value, self._cost.shape[:-1])
+
+
+def _check_spaces(env: Any, *, vectorized: bool) -> None:
+    """Raises ValueError for spaces of which TorchRL's specs say something else."""
+    action_space = env.single_action_space if vectorized else env.action_space
+    for space in _parts(action_space):
+        # Gymnasium 0.28's MultiDiscrete has no start.
+        if np.any(getattr(space, "start", 0)):
+            raise ValueError(
+                f"env must number its actions from 0, got {space}: wrap it in Gymnasium's "
+                "TransformAction."
+            )
+    if not vectorized:
+        return
+    for space in (env.single_observation_space, action_space):
+        if any(isinstance(part, gymnasium.spaces.Tuple) for part in _parts(space)):
+            raise ValueError(
+                f"env must have no Tuple space if it is vectorized, got {space}: its parts would "
+                "be taken for environments. Use a Dict, or put single environments in a SerialEnv "
+                "or a ParallelEnv."
+            )
+
+
+def _parts(space: gymnasium.Space) -> Iterator[gymnasium.Space]:
+    """A space, and those that it is made of."""
+    yield space
+    if isinstance(space, gymnasium.spaces.Dict):
+        for part in space.values():
+            yield from _parts(part)
+    if isinstance(space, gymnasium.spaces.Tuple):
+        for part in space:
+            yield from _parts(part)
 
 
 def _is_key(key: Any) -> bool:
@@ -292,8 +322,9 @@ class SafeGymWrapper(_CostBesideReward):
 
     Raises:
         TypeError: if ``env`` is a name.
-        ValueError: if ``cost_keys`` is empty or has a key twice, a cost is not a finite number, or
-            discrete actions are not numbered from 0.
+        ValueError: if ``cost_keys`` is empty or has a key twice, a cost is not a finite number,
+            discrete actions are not numbered from 0, or a vectorized environment has a ``Tuple``
+            space.
         KeyError: if a step does not report a cost.
 
     Examples:
@@ -307,6 +338,8 @@ class SafeGymWrapper(_CostBesideReward):
     def __init__(self, env: Any = None, **kwargs: Any) -> None:
         if isinstance(env, str):
             raise TypeError(f"env must be an environment, got {env!r}: SafeGymEnv takes a name.")
+        if isinstance(env, gymnasium.vector.VectorEnv):
+            autoreset.set_mode(env)
         super().__init__(env=env, **kwargs)
 
 

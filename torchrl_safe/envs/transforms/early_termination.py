@@ -31,8 +31,8 @@ class EarlyTermination(CostTally):
     before this transform sums rewards without ``termination_reward``, one after it with.
 
     An environment whose episode ends early is reset alone. Gymnasium's vectorized environments,
-    such as ``GymEnv(name, num_envs=4)``, refuse that:
-    :class:`~torchrl_safe.envs.gym.SafeGymEnv` and :class:`~torchrl.envs.SerialEnv` do not.
+    such as ``GymEnv(name, num_envs=4)``, refuse that. :class:`~torchrl.envs.SerialEnv` does not,
+    nor does :class:`~torchrl_safe.envs.gym.SafeGymEnv` with Gymnasium 1.1 or later.
 
     Args:
         budget (float or Tensor): limit of the undiscounted cost of an episode, one number or one

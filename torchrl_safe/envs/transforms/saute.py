@@ -97,7 +97,9 @@ class Saute(CostTally):
         self.discount: float = discount
 
     def advance(self, tally: Tensor, cost: Tensor) -> Tensor:
-        return (tally - cost / self.budget.to(tally)) / self.discount
+        left = tally - cost / self.budget.to(tally)
+        # A budget that is used up but for rounding stays so: the division would make it grow.
+        return torch.where(left.abs() < 1e-6, left, left / self.discount)
 
     def is_spent(self, tally: Tensor) -> Tensor:
         return tally < -ROUNDING

@@ -120,7 +120,8 @@ class CostCritic(CostValues):
         it yourself, once for each batch). The cost advantages are centred and, with
         ``normalize_cost_advantage``, divided by a scale that the loss keeps from call to call.
         Steps that the loss leaves out do not count. Those that pad a trajectory, by
-        ``("collector", "mask")``, also end it.
+        ``("collector", "mask")``, also end it. What critics read of them must be finite, as the
+        zeros of TorchRL's padding are.
 
         Call it on the batch as it was collected. A call of the loss with data without advantages
         does the same first. Neither can tell whether you have shuffled a dimension of time.

@@ -20,7 +20,7 @@ from torchrl.objectives import PPOLoss
 
 from torchrl_safe._checks import check_flag
 from torchrl_safe.objectives._checks import get_or_raise, initial_multiplier
-from torchrl_safe.objectives._reduction import report_each
+from torchrl_safe.objectives._reduction import counted, expanded_mask, report_each
 from torchrl_safe.objectives.critics.cost_critic import CostCritic, CostKeys
 from torchrl_safe.objectives.functional import cost_advantage_scale, penalized_advantage
 from torchrl_safe.objectives.on_policy.policies import Evaluated, Policy, evaluate
@@ -115,6 +115,7 @@ class ConstrainedLoss(CostCritic):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = tensordict.clone(False)
         advantage, cost_advantage = self._advantages(tensordict)
+        self._fill_padding(tensordict, advantage)
         losses = self.policy_losses(tensordict, advantage, cost_advantage)
         self._set_cost_critic_outputs(losses, tensordict)
         for name in self.cost_buffers:
@@ -127,6 +128,21 @@ class ConstrainedLoss(CostCritic):
         cost_advantage = tensordict.get(self.tensor_keys.cost_advantage)
         self._check_width(self.tensor_keys.cost_advantage, cost_advantage)
         return tensordict.get(self.tensor_keys.advantage), cost_advantage
+
+    def _fill_padding(self, tensordict: TensorDictBase, advantage: Tensor) -> None:
+        """Makes the stored policy usable where steps do not count.
+
+        Padding holds zeros. A divergence from a deviation of 0 is infinite, and infinity times 0 is
+        NaN in the gradient. 1 is a usable deviation, concentration, logit and mask.
+        """
+        mask, actor = counted(self, tensordict, advantage), self.actor_network
+        if mask is None or not isinstance(actor, ProbabilisticTensorDictSequential):
+            return
+        stored = tensordict.select(*actor[-1].in_keys, strict=False)
+        filled = stored.apply(
+            lambda values: torch.where(expanded_mask(mask, values), values, torch.ones_like(values))
+        )
+        tensordict.update(filled)
 
     def _own_out_keys(self) -> list[NestedKey]:
         reported = [f"{name}_{i}" for name in self.cost_buffers for i in range(self.num_costs)]

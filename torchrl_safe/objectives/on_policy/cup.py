@@ -121,7 +121,11 @@ class CUPLoss(ConstrainedPPO, ClipPPOLoss):
     def policy_losses(
         self, tensordict: TensorDictBase, advantage: Tensor, cost_advantage: Tensor
     ) -> TensorDictBase:
-        return self.unconstrained(tensordict, advantage)
+        policy = self.evaluate(tensordict)
+        losses = self.unconstrained(tensordict, advantage, policy)
+        # The phase ends by it. TorchRL's is a mean over all steps, with those that do not count.
+        kl = reduced(self, policy.kl_approx.detach(), tensordict, reduction="mean")
+        return losses.set("kl_approx", kl)
 
     def start_projection(self) -> None:
         """Keeps the policy as it is now, for :meth:`projection_loss` to stay near it."""
