@@ -162,10 +162,11 @@ def check_fit(env: EnvBase, saved: Policy, config: Config) -> None:
 
 
 def cost_names(env: EnvBase) -> tuple[str, ...]:
-    """Names of the costs; an environment that is not ours has their numbers."""
-    base = base_env(env)
-    named = isinstance(base, ArmEnv | SafeGymEnv | SafeGymWrapper)
-    return base.cost_names if named else tuple(map(str, range(num_costs(env))))
+    """Names of the costs; those of an environment that is not ours are "cost", or numbered."""
+    base, count = base_env(env), num_costs(env)
+    if isinstance(base, ArmEnv | SafeGymEnv | SafeGymWrapper):
+        return base.cost_names
+    return ("cost",) if count == 1 else tuple(f"cost {index}" for index in range(count))
 
 
 def play(

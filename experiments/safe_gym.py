@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
 from pathlib import Path
 from time import strftime
@@ -459,6 +459,16 @@ class Learner:
                 break
 
 
+def check_costs(episode_cost: Tensor, names: Sequence[str]) -> None:
+    """Raises ValueError for costs that are negative, which no limit bounds."""
+    if (negative := (episode_cost < 0).any(0)).any():
+        wrong = [name for name, is_wrong in zip(names, negative.tolist(), strict=True) if is_wrong]
+        raise ValueError(
+            f"Costs must not be negative, since a limit is an upper bound; {wrong} summed up to "
+            f"{episode_cost[:, negative].min():g}. Negate them in a wrapper."
+        )
+
+
 def begin_episodes(config: Config, collector: Collector, frames: int) -> None:
     """Begins all episodes anew; what follows depends on the seed and on ``frames`` only.
 
@@ -521,6 +531,7 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     ) as bar:
         for batch in islice(collector, batches - len(log.rows)):
             episodes = batch["next"][batch["next", "done"].squeeze(-1)]
+            check_costs(episodes["episode_cost"], config.cost_keys)
             if updater is not None:
                 updater.step(episodes["episode_cost"])
             kl = learner.learn(batch)

@@ -34,7 +34,7 @@ class Slide(gymnasium.Env):
         self.place += self.speed
         self.count += 1
         fast, far = max(self.speed - 0.05, 0) * self.cost_size, float(self.place > 1)
-        info = {"cost": fast, "costs": {"fast": fast, "far": far}}
+        info = {"cost": fast, "costs": {"fast": fast, "far": far, "gain": -fast}}
         truncated = self.count == STEPS
         return self.observe(), self.speed * self.reward_size, False, truncated, info
 

@@ -26,6 +26,12 @@ class Odd(Counting):
         return (observation, observation + 10), info
 
 
+class OneOfTwo(Counting):
+    """Says that it returns two rewards, and returns one, as a wrapper of mo-gymnasium's does."""
+
+    reward_space = Box(-np.inf, np.inf, (2,))
+
+
 def several(make):
     return SyncVectorEnv([make] * 2, autoreset_mode=AutoresetMode.DISABLED)
 
@@ -60,3 +66,11 @@ def test_the_parts_of_a_tuple_are_not_taken_for_environments(spaces):
 def test_a_single_environment_may_observe_a_tuple(make_env):
     env = make_env(SafeGymWrapper, Odd(observation_space=PAIR))
     assert env.reset()["observation"].tolist() == [[0], [10]]
+
+
+def test_rewards_of_several_numbers_are_refused(make_env):
+    with pytest.raises(ValueError, match=r"one reward, of shape \(1,\), got .* shape \(2,\)"):
+        SafeGymWrapper(OneOfTwo())
+    env = OneOfTwo()
+    env.reward_space = Box(-np.inf, np.inf, ())  # As the error says.
+    assert make_env(SafeGymWrapper, env).rollout(2)["next", "reward"].tolist() == [[10], [20]]

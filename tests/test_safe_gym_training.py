@@ -363,6 +363,12 @@ def test_settings_that_make_no_sense(changes, message):
         replace(SMALL, **changes)
 
 
+def test_costs_that_no_limit_bounds(tmp_path):
+    """Gymnasium's HalfCheetah reports what its control costs as a negative reward."""
+    with pytest.raises(ValueError, match=r"not be negative, .*; \['costs.gain'\] summed up to -"):
+        train(replace(SMALL, cost_keys=("cost", "costs.gain"), out=tmp_path), progress=False)
+
+
 def test_episodes_that_never_end(tmp_path):
     """A checkpoint after 16 of the 20 steps of an episode begins it anew."""
     with pytest.raises(ValueError, match="env must have episodes that end, got none from 'sliding"):

@@ -53,6 +53,7 @@ class Arm:
         env = TransformedEnv(arm, RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]))
         observations = env.observation_spec["observation"].shape[-1]
         actor = make_actor(observations)
+        self.env, self.actor = env, actor
         critic = ValueOperator(MLP(observations, 1, num_cells=[8]), ["observation"])
         cost_critic = ValueOperator(
             MLP(observations, 2, num_cells=[8]), ["observation"], ["cost_value"]
@@ -123,6 +124,23 @@ def read_log(folder, name):
     (file,) = folder.rglob(f"{name}.csv")
     with file.open() as rows:
         return [(int(step), float(value)) for step, value in csv.reader(rows)]
+
+
+@pytest.mark.parametrize("traj_format", ["cat", "padded"])
+def test_whole_trajectories(make_arm, traj_format):
+    arm = make_arm()
+    arm.collector.shutdown(close_env=False)
+    arm.collector = Collector(
+        arm.env,
+        arm.actor,
+        frames_per_batch=FRAMES,
+        trajs_per_batch=WORLDS,
+        traj_format=traj_format,
+        auto_register_policy_transforms=False,
+    )
+    arm.safe_trainer().train()
+    assert (arm.loss.lagrange_multiplier > 0).any()
+    assert all(parameter.isfinite().all() for parameter in arm.loss.parameters())
 
 
 def test_an_updater_of_another_loss(make_arm):

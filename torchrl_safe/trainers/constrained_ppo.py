@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -129,12 +130,18 @@ class ConstrainedPPOTrainer(PPOTrainer):
             frame_skip=frame_skip,
             optim_steps_per_batch=optim_steps_per_batch,
             add_gae=add_gae,
-            # A bound method: the parent would call set_keys of an object, with the reward's key.
-            gae=loss_module.estimate_advantages if add_gae and gae is None else gae,
+            # A function: the parent would call set_keys of an object, with the reward's key.
+            gae=partial(_estimate, loss_module) if add_gae and gae is None else gae,
             done_key=done_key,
             **kwargs,
         )
         hook.register(self)
+
+
+def _estimate(loss_module: LossModule, batch: TensorDictBase) -> TensorDictBase:
+    if batch.ndim == 1:  # One trajectory after the other: the collector's traj_format="cat".
+        batch.names = ["time"]
+    return loss_module.estimate_advantages(batch)
 
 
 def _check_loss(loss_module: LossModule) -> None:

@@ -69,6 +69,12 @@ class _CostBesideReward(GymWrapper):
         self._one_observation = next(iter(self.observation_spec.items(True, True)))
         reward = self.full_reward_spec["reward"]
         self._one_reward = reward
+        if reward.shape != (shape := (*self.batch_size, 1)):
+            raise ValueError(
+                f"env must have one reward, of shape {tuple(shape)}, got reward_space of shape "
+                f"{tuple(reward.shape)}. If its reward is one number after all, set "
+                "env.reward_space = gymnasium.spaces.Box(-inf, inf, ())."
+            )
         self._flag_shape = (*self.batch_size, 1)
         self.reward_spec = Composite(
             reward=reward,
@@ -323,8 +329,8 @@ class SafeGymWrapper(_CostBesideReward):
     Raises:
         TypeError: if ``env`` is a name.
         ValueError: if ``cost_keys`` is empty or has a key twice, a cost is not a finite number,
-            discrete actions are not numbered from 0, or a vectorized environment has a ``Tuple``
-            space.
+            discrete actions are not numbered from 0, the reward is not one number, or a vectorized
+            environment has a ``Tuple`` space.
         KeyError: if a step does not report a cost.
 
     Examples:
