@@ -91,7 +91,7 @@ def test_evaluation_in_any_environment_with_a_cost(mine, tmp_path, capsys):
     ):
         evaluate.main(evaluate.Config(tmp_path / "policy.pt", **{**settings, "env": None}))
     shown = capsys.readouterr().out
-    assert "episode cost: 2" in shown
+    assert "episode cost: cost 2" in shown
     assert "success" not in shown
     with pytest.raises(ValueError, match="max_steps must let every episode end, got 4, after"):
         evaluate.main(evaluate.Config(tmp_path / "policy.pt", max_steps=4, **settings))
