@@ -460,11 +460,11 @@ class Learner:
 
 
 def check_costs(episode_cost: Tensor, names: Sequence[str]) -> None:
-    """Raises ValueError for costs that are negative, which no limit bounds."""
+    """Raises ValueError for episodes that cost less than 0, which no limit bounds."""
     if (negative := (episode_cost < 0).any(0)).any():
         wrong = [name for name, is_wrong in zip(names, negative.tolist(), strict=True) if is_wrong]
         raise ValueError(
-            f"Costs must not be negative, since a limit is an upper bound; {wrong} summed up to "
+            f"Episodes must not cost less than 0, since a limit is an upper bound; {wrong} cost "
             f"{episode_cost[:, negative].min():g}. Negate them in a wrapper."
         )
 
@@ -531,8 +531,8 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
     ) as bar:
         for batch in islice(collector, batches - len(log.rows)):
             episodes = batch["next"][batch["next", "done"].squeeze(-1)]
-            check_costs(episodes["episode_cost"], config.cost_keys)
             if updater is not None:
+                check_costs(episodes["episode_cost"], config.cost_keys)
                 updater.step(episodes["episode_cost"])
             kl = learner.learn(batch)
             row = {**figures(episodes, loss, config.cost_keys), "kl": kl}

@@ -108,15 +108,17 @@ def test_a_budget_that_is_just_used_up_is_not_exceeded_by_rounding(budget):
     assert saute.is_spent(saute.advance(left, torch.full((1, 1), 1e-3 * budget)))
 
 
-def test_a_discount_does_not_let_rounding_grow():
+@pytest.mark.parametrize(("discount", "count"), [(0.99, 4), (0.99, 200), (0.97, 50)])
+def test_a_discount_does_not_let_rounding_grow(discount, count):
     """After four steps -3e-8 is left, which 0.99 would make -1e-4 in 806 more."""
-    saute = Saute(sum(0.99**step for step in range(4)), unsafe_reward=-1.0, discount=0.99)
+    budget = sum(discount**step for step in range(count))
+    saute = Saute(budget, unsafe_reward=-1.0, discount=discount)
     left = torch.ones(1, 1)
     for step in range(1500):
-        left = saute.advance(left, torch.tensor([[1.0 if step < 4 else 0.0]]))
+        left = saute.advance(left, torch.tensor([[1.0 if step < count else 0.0]]))
         assert not saute.is_spent(left)
     assert left.item() != 0
-    assert saute.is_spent(saute.advance(left, torch.tensor([[1e-3]])))
+    assert saute.is_spent(saute.advance(left, torch.full((1, 1), 1e-3 * budget)))
 
 
 def test_flags_use_up_a_budget_like_numbers():

@@ -143,6 +143,14 @@ def test_whole_trajectories(make_arm, traj_format):
     assert all(parameter.isfinite().all() for parameter in arm.loss.parameters())
 
 
+def test_steps_in_an_unknown_order(make_arm):
+    """They may be of several worlds, or shuffled."""
+    arm = make_arm()
+    arm.collector.postproc = lambda batch: batch.reshape(-1)
+    with pytest.raises(ValueError, match="must have a dimension of time"):
+        arm.safe_trainer().train()
+
+
 def test_an_updater_of_another_loss(make_arm):
     arm = make_arm()
     other = DualAscent(make_loss(num_costs=2), cost_limit=1.0, lr=0.5)

@@ -70,7 +70,11 @@ class Checked(Generic[_T]):
     def __get__(self, instance: object, owner: type) -> _T: ...
 
     def __get__(self, instance: object | None, owner: type) -> Checked[_T] | _T:
-        return self if instance is None else instance.__dict__[self._name]
+        if instance is None:
+            return self
+        if self._name not in instance.__dict__:
+            raise AttributeError(f"{type(instance).__name__} has not set {self._name} yet.")
+        return instance.__dict__[self._name]
 
     def __set__(self, instance: object, value: Any) -> None:
         instance.__dict__[self._name] = self._check(self._name, value)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torchrl.collectors import BaseCollector
 from torchrl.objectives import LossModule
 from torchrl.trainers.algorithms import PPOTrainer
 
@@ -131,17 +131,26 @@ class ConstrainedPPOTrainer(PPOTrainer):
             optim_steps_per_batch=optim_steps_per_batch,
             add_gae=add_gae,
             # A function: the parent would call set_keys of an object, with the reward's key.
-            gae=partial(_estimate, loss_module) if add_gae and gae is None else gae,
+            gae=_estimation(loss_module, kwargs["collector"]) if add_gae and gae is None else gae,
             done_key=done_key,
             **kwargs,
         )
         hook.register(self)
 
 
-def _estimate(loss_module: LossModule, batch: TensorDictBase) -> TensorDictBase:
-    if batch.ndim == 1:  # One trajectory after the other: the collector's traj_format="cat".
-        batch.names = ["time"]
-    return loss_module.estimate_advantages(batch)
+def _estimation(
+    loss_module: LossModule, collector: BaseCollector
+) -> Callable[[TensorDictBase], TensorDictBase]:
+    """What estimates both advantages of the collector's batches."""
+    # Then they are whole trajectories, one after the other, in a dimension without a name.
+    joined = getattr(collector, "trajs_per_batch", None) and collector.traj_format == "cat"
+
+    def estimate(batch: TensorDictBase) -> TensorDictBase:
+        if joined:
+            batch.names = ["time"]
+        return loss_module.estimate_advantages(batch)
+
+    return estimate
 
 
 def _check_loss(loss_module: LossModule) -> None:

@@ -161,8 +161,8 @@ class MultiplierHook(TrainerHookBase):
             )
         if getattr(trainer.collector, "reset_at_each_iter", False):
             raise ValueError(
-                "reset_at_each_iter of the collector must be False: it cuts episodes at the end of "
-                "a batch, and the cost of those would never count."
+                "reset_at_each_iter of the collector must be False: the cost of episodes that it "
+                "cuts would never count. Where batches are of whole episodes it changes nothing."
             )
         if trainer.learner_backend != "local":
             raise ValueError(

@@ -99,7 +99,7 @@ class Saute(CostTally):
     def advance(self, tally: Tensor, cost: Tensor) -> Tensor:
         left = tally - cost / self.budget.to(tally)
         # A budget that is used up but for rounding stays so: the division would make it grow.
-        return torch.where(left.abs() < 1e-6, left, left / self.discount)
+        return torch.where(left.abs() < ROUNDING, left, left / self.discount)
 
     def is_spent(self, tally: Tensor) -> Tensor:
         return tally < -ROUNDING

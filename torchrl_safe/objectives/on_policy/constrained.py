@@ -133,16 +133,20 @@ class ConstrainedLoss(CostCritic):
         """Makes the stored policy usable where steps do not count.
 
         Padding holds zeros. A divergence from a deviation of 0 is infinite, and infinity times 0 is
-        NaN in the gradient. 1 is a usable deviation, concentration, logit and mask.
+        NaN in the gradient. 1 is a usable deviation, concentration, logit and action mask.
         """
         mask, actor = counted(self, tensordict, advantage), self.actor_network
         if mask is None or not isinstance(actor, ProbabilisticTensorDictSequential):
             return
+
+        def filled(values: Tensor) -> Tensor:
+            empty = (values.reshape(*mask.shape[:-1], -1) == 0).all(-1, keepdim=True)
+            return torch.where(
+                expanded_mask(empty & ~mask, values), torch.ones_like(values), values
+            )
+
         stored = tensordict.select(*actor[-1].in_keys, strict=False)
-        filled = stored.apply(
-            lambda values: torch.where(expanded_mask(mask, values), values, torch.ones_like(values))
-        )
-        tensordict.update(filled)
+        tensordict.update(stored.apply(filled))
 
     def _own_out_keys(self) -> list[NestedKey]:
         reported = [f"{name}_{i}" for name in self.cost_buffers for i in range(self.num_costs)]
