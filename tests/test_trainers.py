@@ -143,6 +143,12 @@ def test_whole_trajectories(make_arm, traj_format):
     assert all(parameter.isfinite().all() for parameter in arm.loss.parameters())
 
 
+def test_a_missing_collector_is_named(make_arm):
+    arm = make_arm()
+    with pytest.raises(TypeError, match=r"missing .* 'collector'"):
+        ConstrainedPPOTrainer(loss_module=arm.loss, updater=arm.updater)
+
+
 def test_steps_in_an_unknown_order(make_arm):
     """They may be of several worlds, or shuffled."""
     arm = make_arm()

@@ -28,6 +28,7 @@ class ConstrainedPPOTrainer(PPOTrainer):
     batch. TorchRL warns that its trainers are experimental.
 
     Keyword Args:
+        collector (BaseCollector): yields the batches.
         loss_module (LossModule): :class:`~torchrl_safe.objectives.PPOLagrangianLoss`,
             :class:`~torchrl_safe.objectives.LagrangianLoss` or any other on-policy loss with a
             cost critic that one optimizer minimizes as it stands.
@@ -45,8 +46,8 @@ class ConstrainedPPOTrainer(PPOTrainer):
             ``loss_module.estimate_advantages``.
         done_key (NestedKey, optional): see ``PPOTrainer``. Defaults to ``"done"``.
         episode_cost_key (NestedKey, optional): see :class:`MultiplierHook`.
-        **kwargs: every other keyword argument of ``PPOTrainer``, among them ``collector``,
-            ``total_frames``, ``optimizer``, ``replay_buffer``, ``logger``, ``log_interval`` and
+        **kwargs: every other keyword argument of ``PPOTrainer``, among them ``total_frames``,
+            ``optimizer``, ``replay_buffer``, ``logger``, ``log_interval`` and
             ``num_epochs``.
 
     Raises:
@@ -106,6 +107,7 @@ class ConstrainedPPOTrainer(PPOTrainer):
     def __init__(
         self,
         *,
+        collector: BaseCollector,
         loss_module: LossModule,
         updater: CostUpdater,
         frame_skip: int = 1,
@@ -125,13 +127,16 @@ class ConstrainedPPOTrainer(PPOTrainer):
         if gamma is not None:
             loss_module.make_value_estimator(gamma=gamma, lmbda=lmbda)
             loss_module.make_cost_value_estimator(gamma=gamma, lmbda=lmbda)
+        if add_gae and gae is None:
+            # A function: the parent would call set_keys of an object, with the reward's key.
+            gae = _estimation(loss_module, collector)
         super().__init__(
+            collector=collector,
             loss_module=loss_module,
             frame_skip=frame_skip,
             optim_steps_per_batch=optim_steps_per_batch,
             add_gae=add_gae,
-            # A function: the parent would call set_keys of an object, with the reward's key.
-            gae=_estimation(loss_module, kwargs["collector"]) if add_gae and gae is None else gae,
+            gae=gae,
             done_key=done_key,
             **kwargs,
         )
