@@ -64,6 +64,7 @@ def jobs(config: Config) -> dict[Path, tuple[TrainConfig, AlgorithmName]]:
                 multiplier_rule=rule,
                 multiplier_init=value if rule == "fixed" else 0.0,
                 cost_limit=0.0 if rule == "fixed" else value,
+                limit_share=1.0,  # What a limit gives, not what a margin does.
                 seed=seed,
                 frames=config.frames,
                 eval_episodes=config.eval_episodes,
