@@ -275,6 +275,8 @@ def main(config: Config) -> None:
         if own := own_settings(config, name):
             chosen = ", ".join(f"{option} {value:g}" for option, value in own.items())
             print(f"{name} has settings of its own (--no-own-settings): {chosen}.")
+    if config.limit_share < 1:
+        print(f"Algorithms with limits aim at {config.limit_share:.0%} of each (--limit-share).")
     for algorithm, result in finish(config, todo):
         done = {**results["algorithms"], algorithm: result}
         # In one order, whichever ends first.
