@@ -171,8 +171,8 @@ class Config:
     """What a batch far above its limit adds to the multiplier."""
     limit_share: float = 0.7
     """Share of each limit that training aims at; reports have the whole limit. Less than 1 leaves a
-    margin: costs drift while the noise gets less, and faster than the multiplier follows; and a
-    policy may cost more without its noise, and in another engine."""
+    margin: costs may drift faster than the multiplier follows, and a policy may cost more without
+    its noise, and in another engine."""
     pessimism: float = 2.0
     """Standard errors added to the mean cost of a batch: twice as many with cpo and pcpo, none
     with p3o and ipo."""
