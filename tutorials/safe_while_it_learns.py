@@ -180,6 +180,6 @@ for name, shield in {"with its shield": Shield(), "without": None}.items():
 # - Or learn to do without it: add ``"correction": ShieldCorrection()`` to the costs, and limit both
 #   with ``PPOLagrangianLoss``, as in `several costs, several limits <several_limits.html>`_.
 #   ``make train`` does so with ``--algorithms ppo-lagrangian-shield --costs collision 0.5
-#   correction 0.04 --physics mujoco``.
+#   correction 0.06 --physics mujoco``.
 # - Train with ``Shield(rate=5)``. How much more slowly does the arm move, and learn?
 # - `What the shield guarantees, and what it does not <../shield.html>`_.
