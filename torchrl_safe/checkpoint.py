@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import shutil
 import warnings
 from collections import OrderedDict
@@ -24,7 +23,7 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-from torchrl_safe._checks import as_number, check_kind
+from torchrl_safe._checks import check_kind, is_number
 from torchrl_safe._files import UNFINISHED, publish
 
 _PLAIN = (bool, int, float, str, type(None))
@@ -125,7 +124,7 @@ class RunCheckpoints:
             raise ValueError(
                 f"step must be a whole number of at least 0, got {step!r}, and at most 12 digits."
             )
-        if score is not None and math.isnan(as_number(score)):
+        if score is not None and not is_number(score):
             raise ValueError(f"score must be a number, got {score!r}.")
         path = self.folder / f"checkpoint-{step:012d}.torchrl"
         later = [file for file in self._files() if file.name > path.name]
