@@ -263,7 +263,8 @@ def _of_ppo(make: Callable[..., LossModule]) -> Any:
 
 
 def _budgets(config: Config) -> torch.Tensor:
-    return torch.tensor([*config.aims.values()])
+    # No margin: each episode keeps its budget, not their mean.
+    return torch.tensor([*config.cost_limits.values()])
 
 
 def _with_budget(config: Config) -> list[Transform]:

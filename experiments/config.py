@@ -172,7 +172,8 @@ class Config:
     limit_share: float = 0.7
     """Share of each limit that training aims at; reports have the whole limit. Less than 1 leaves a
     margin: costs may drift faster than the multiplier follows, and a policy may cost more without
-    its noise, and in another engine."""
+    its noise, and in another engine. A budget, of ppo-saute and ppo-early-termination, is all of
+    the limit."""
     pessimism: float = 2.0
     """Standard errors added to the mean cost of a batch: twice as many with cpo and pcpo, none
     with p3o and ipo."""

@@ -39,7 +39,7 @@ from torchrl_safe.policy import Policy, load_policy
 # The settings of a training run that make its environment. Older files lack some of them.
 _ENVIRONMENT = (
     "arm", "task", "obstacles", "action", "observation", "paper",
-    "cost_limit", "costs", "limit_share", "suite_task", "physics",
+    "cost_limit", "costs", "suite_task", "physics",
 )  # fmt: skip
 
 

@@ -98,13 +98,14 @@ def test_every_limit_reaches_the_updater():
 
 
 def test_a_share_of_each_limit_is_what_training_aims_at():
-    """Updaters and budgets have the share, reports the limit."""
+    """Updaters have the share, budgets and reports the limit."""
     config = suite_config("iiwa-reach-joints", physics="mujoco", limit_share=0.5)
     env = make_env(config, 2, 0, "ppo-saute", training=True)
     (transform,) = (each for each in env.transform if hasattr(each, "budget"))
     updater = ALGORITHMS["ppo-lagrangian"].build(env, config).updater
-    assert updater.cost_limit.tolist() == transform.budget.tolist() == [0.125, 0.25, 0.25]
+    assert updater.cost_limit.tolist() == [0.125, 0.25, 0.25]
     assert config.cost_limits == {"collision": 0.25, "joint-limit": 0.5, "speed": 0.5}
+    assert transform.budget.tolist() == [0.25, 0.5, 0.5]
     env.close()
 
 
@@ -114,14 +115,17 @@ def test_training_aims_at_one_share_of_all_limits_below_them():
 
 
 def test_a_saved_policy_is_evaluated_with_the_budget_of_its_training():
-    settings = json.loads(json.dumps(dataclasses.asdict(Config(limit_share=0.5)), default=str))
+    settings = json.loads(json.dumps(dataclasses.asdict(Config(cost_limit=3.0)), default=str))
     saved = SimpleNamespace(settings={**settings, "name": "ppo-saute"})
-    assert evaluate.training_config(saved).aims == {"collision": 0.25}
+    env = make_env(evaluate.training_config(saved), num_envs=1, algorithm="ppo-saute")
+    (transform,) = (each for each in env.transform if hasattr(each, "budget"))
+    assert transform.budget.tolist() == [3.0]
+    env.close()
 
 
 @pytest.mark.parametrize("algorithm", ["ppo-saute", "ppo-early-termination"])
 def test_every_limit_is_a_budget(algorithm):
-    config = suite_config(NAME, physics="mujoco", limit_share=1.0)
+    config = suite_config(NAME, physics="mujoco")
     env = make_env(config, num_envs=1, algorithm=algorithm, training=True)
     (transform,) = (each for each in env.transform if hasattr(each, "budget"))
     assert transform.budget.tolist() == [*SUITE[NAME].cost_limits.values()]
