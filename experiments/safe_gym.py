@@ -469,6 +469,14 @@ def check_costs(episode_cost: Tensor, names: Sequence[str]) -> None:
         )
 
 
+def check_finite(batch: TensorDictBase, *keys: str) -> None:
+    """Raises ValueError for what no policy can learn from."""
+    for key in keys:
+        if not (values := batch[key]).isfinite().all():
+            wrong = values[~values.isfinite()][0]
+            raise ValueError(f"env must return a finite {key} in every step, got {wrong}.")
+
+
 def begin_episodes(config: Config, collector: Collector, frames: int) -> None:
     """Begins all episodes anew; what follows depends on the seed and on ``frames`` only.
 
@@ -492,6 +500,7 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
         random = env.rollout(
             math.ceil(config.random_frames / config.envs), break_when_any_done=False
         )
+    check_finite(random["next"], "observation", "reward")
     agent.standardize.update(random["observation"])
     batches = math.ceil(config.frames / config.frames_per_batch)
     learner = Learner(config, agent, batches)
@@ -530,6 +539,7 @@ def train(config: Config, *, progress: bool = True) -> tuple[Agent, Log]:
         disable=not progress,
     ) as bar:
         for batch in islice(collector, batches - len(log.rows)):
+            check_finite(batch["next"], "observation", "reward")
             episodes = batch["next"][batch["next", "done"].squeeze(-1)]
             if updater is not None:
                 check_costs(episodes["episode_cost"], config.cost_keys)

@@ -62,6 +62,7 @@ class SlideMatrix(Slide):
 
 gymnasium.register("Slide-v0", Slide)
 gymnasium.register("SlideScaled-v0", lambda: Slide(reward_size=128.0, cost_size=1024.0))
+gymnasium.register("SlideNaN-v0", lambda: Slide(reward_size=np.nan))
 gymnasium.register("SlideDiscrete-v0", SlideDiscrete)
 gymnasium.register("SlideGrid-v0", SlideGrid)
 gymnasium.register("SlideMatrix-v0", SlideMatrix)

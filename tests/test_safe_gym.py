@@ -395,6 +395,10 @@ def test_a_step_without_a_cost_raises(make_env):
         ValueError, match=r"cost 'costs' must be a number, got a group: .*'costs', "
     ):
         group.rollout(1)
+    masked = make_env(SafeGymWrapper, vector(AutoresetMode.DISABLED), cost_keys=["costs"])
+    entries = r"\[\('costs', 'one'\), \('costs', 'count'\)\]"
+    with pytest.raises(ValueError, match=f"name its entries, {entries}"):
+        masked.rollout(1)
     no_mapping = make_env(SafeGymWrapper, Counting(), cost_keys=[("cost", "heat")])
     with pytest.raises(KeyError, match=r"info must have \('cost', 'heat'\) in every step"):
         no_mapping.rollout(1)
@@ -462,6 +466,20 @@ def test_rows_may_report_costs_of_other_types(make_env, forked_workers, asynchro
     )
     after = env.step(env.reset().set("action", torch.tensor([[-0.5], [0.5]])))
     assert after["next", "cost"].tolist() == [[0, 0, 0], [1, 0.5, 0.5]]
+
+
+@by_mode
+def test_an_integer_in_the_first_row_truncates_no_other(make_env, mode):
+    env = make_env(SafeGymWrapper, vector(mode, partial(Returns, 0), partial(Returns, 0.75)))
+    assert env.rollout(2)["next", "cost"].squeeze(-1).tolist() == [[0, 0], [0.75, 0.75]]
+
+
+def test_integers_of_processes_warn(make_env, forked_workers):
+    """Their fractions are lost in Gymnasium."""
+    rows = partial(Returns, 0), partial(Returns, 0.75)
+    env = make_env(SafeGymWrapper, vector(AutoresetMode.DISABLED, *rows, kind=AsyncVectorEnv))
+    with pytest.warns(UserWarning, match=r"cost 'cost' is int64 .* Return float\(cost\)"):
+        env.rollout(1)
 
 
 @by_mode

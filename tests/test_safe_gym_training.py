@@ -11,6 +11,7 @@ from unittest.mock import Mock
 import gymnasium
 import numpy as np
 import pytest
+import sliding
 import torch
 from torch.distributions import kl_divergence
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -361,6 +362,16 @@ def test_divergence_is_that_of_the_distributions(make_env):
 def test_settings_that_make_no_sense(changes, message):
     with pytest.raises(ValueError, match=message):
         replace(SMALL, **changes)
+
+
+def test_what_is_not_finite_is_named(tmp_path, monkeypatch):
+    nan = replace(SMALL, env="sliding:SlideNaN-v0", out=tmp_path)
+    with pytest.raises(ValueError, match="env must return a finite reward in every step, got nan"):
+        main(nan)
+    monkeypatch.setattr(sliding.Slide, "observe", lambda self: np.array([np.inf, 0.0]))
+    with pytest.raises(ValueError, match=r"must return a finite observation in .*, got inf"):
+        main(replace(SMALL, out=tmp_path))
+    assert not list(tmp_path.iterdir())
 
 
 def test_costs_that_no_limit_bounds(tmp_path):

@@ -226,6 +226,31 @@ def test_named_costs_of_vectors(make_env, touching):
     check_same(replay(env, SEED, AHEAD[None])[0], touching)
 
 
+@pytest.mark.parametrize("num_envs", [0, 2])
+def test_a_cost_that_is_left_out_after_a_press(make_env, num_envs):
+    """Safety-Gymnasium itself takes it for 0: it is not in the sum."""
+    keys = ["cost_buttons", "cost_gremlins", "cost_hazards", "cost_sum"]
+    env = make_env(SafeGymEnv, BUTTON, cost_keys=keys, num_envs=num_envs, asynchronous=False)
+    env.set_seed(SEED)
+    first = (env._env.envs[0] if num_envs else env._env).unwrapped
+    costs, tensordict = [], env.reset()
+    for step, action in enumerate(torch.as_tensor(AHEAD)):
+        if step == 33:
+            first.task.buttons.reset_timer()  # As the task does where the goal button is touched.
+        assert ("cost_buttons" in first.task.calculate_cost()) == (step < 33)
+        tensordict["action"] = action.expand(env.action_spec.shape)
+        after, tensordict = env.step_and_maybe_reset(tensordict)
+        costs.append(after["next", "cost"])
+    costs = torch.stack(costs)
+    assert torch.equal(costs[..., :3].sum(-1), costs[..., 3])
+    assert costs[-1].reshape(-1, 4)[0].tolist() == [0, 0, 1, 1]
+
+
+def test_a_cost_that_was_never_there_is_not_left_out(make_env):
+    with pytest.raises(KeyError, match=r"info must have \('cost_button',\) in every step"):
+        make_env(SafeGymEnv, BUTTON, cost_keys=["cost_button"]).rollout(1)
+
+
 def test_named_costs_of_rows_that_end_apart(make_env):
     """No task with named costs has a fast reset, so the steps of this one are counted."""
 

@@ -5,6 +5,7 @@ Import from :mod:`torchrl_safe.envs.gym`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
@@ -14,6 +15,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
@@ -46,6 +48,7 @@ class _CostBesideReward(GymWrapper):
         if len(set(keys)) < len(keys):
             raise ValueError(f"cost_keys must be different keys, got {cost_keys!r}.")
         self._cost_paths = [(key,) if isinstance(key, str) else key for key in keys]
+        self._reported: set[tuple[str, ...]] = set()  # Which of them a step has had.
         check_count(frame_skip=kwargs.get("frame_skip", 1))
         super().__init__(*args, **kwargs)
 
@@ -185,8 +188,13 @@ class _CostBesideReward(GymWrapper):
             observation = autoreset.last_observation(self._env, observation, info, done)
             info = autoreset.last_info(info, done)
         for column, path in enumerate(self._cost_paths):
-            own = cost and path == ("cost",)
-            value = cost[0] if own else _look_up(info, path)
+            if cost and path == ("cost",):
+                value = cost[0]
+            else:
+                # Safety-Gymnasium leaves cost_buttons out for ten steps after a button is pressed.
+                may_lack = "cost_sum" in info and path in self._reported
+                value = _look_up(info, path, may_lack=may_lack)
+                self._reported.add(path)
             self._cost[..., column] += self._checked(path, value)
         return observation, reward, terminated, truncated, done, info
 
@@ -196,7 +204,7 @@ class _CostBesideReward(GymWrapper):
             return value
         name = f"cost {'.'.join(path)!r}"
         if isinstance(value, Mapping):
-            entries = [(*path, key) for key in value]
+            entries = [(*path, key) for key in _names(value)]
             raise ValueError(f"{name} must be a number, got a group: name its entries, {entries}.")
         if isinstance(value, np.ndarray) and value.dtype == object:
             value = value.tolist()  # Gymnasium puts NumPy's bools and tensors into such an array.
@@ -250,23 +258,29 @@ def _encode(spec: TensorSpec, value: Any) -> Tensor:
     return torch.from_numpy(np.array(value, dtype).reshape(spec.shape))
 
 
-def _look_up(info: Any, path: tuple[str, ...]) -> Any:
-    """The entry of an info; raises unless every environment has it."""
+def _look_up(info: Any, path: tuple[str, ...], *, may_lack: bool) -> Any:
+    """The entry of an info. Where it is missing, 0 if it may be; else raises KeyError."""
     entry, present = info, True
     for name in path:
         known = autoreset.entries(entry)
         if name not in known:
-            # Without Gymnasium's masks of the environments that have an entry.
-            names = [key for key in info if f"{key}"[:1] != "_" or f"{key}"[1:] not in info]
+            if may_lack:
+                return np.zeros_like(info["cost_sum"])
             nested = tuple(name.split("."))
             hint = f" An entry of an entry is a tuple: {nested}." if len(nested) > 1 else ""
-            raise KeyError(f"info must have {path} in every step, got only {names}.{hint}")
+            raise KeyError(f"info must have {path} in every step, got only {_names(info)}.{hint}")
         entry, present = known[name], known.get(f"_{name}", True)
-    # Gymnasium's mask of the environments that have the entry, if the info is of several.
-    if isinstance(present, np.ndarray) and not present.all():
+    # Gymnasium's mask of the environments that have the entry, if the info is of several. Its array
+    # has 0 for the others.
+    if not may_lack and isinstance(present, np.ndarray) and not present.all():
         rows = np.flatnonzero(~present).tolist()
         raise KeyError(f"info must have {path} in every step, environments {rows} have none.")
     return entry
+
+
+def _names(info: Mapping) -> list[Any]:
+    """The entries of an info, without Gymnasium's masks of the environments that have one."""
+    return [key for key in info if f"{key}"[:1] != "_" or f"{key}"[1:] not in info]
 
 
 class _FloatCosts(gymnasium.Wrapper):
@@ -314,9 +328,9 @@ class SafeGymWrapper(_CostBesideReward):
     Vectorized environments may use the autoreset modes that TorchRL supports, ``DISABLED`` and
     ``SAME_STEP``. In both, and in the vectorized environments of Gymnasium 0.28 and
     Safety-Gymnasium, which have no modes, you get the true last observation, reward and cost of an
-    episode. In a vectorized environment, make each cost a float: Gymnasium gives an entry of a
+    episode. In an ``AsyncVectorEnv``, make each cost a float: Gymnasium gives an entry of a
     vectorized info the type that it has in the first environment, and fractions are lost if that is
-    an integer.
+    an integer. In a ``SyncVectorEnv`` the wrapper does so.
 
     Args:
         env (gymnasium.Env or gymnasium.vector.VectorEnv): the environment.
@@ -331,7 +345,11 @@ class SafeGymWrapper(_CostBesideReward):
         ValueError: if ``cost_keys`` is empty or has a key twice, a cost is not a finite number,
             discrete actions are not numbered from 0, the reward is not one number, or a vectorized
             environment has a ``Tuple`` space.
-        KeyError: if a step does not report a cost.
+        KeyError: if a step does not report a cost. What Safety-Gymnasium leaves out of some steps
+            costs 0 there.
+
+    Warns:
+        UserWarning: if a cost of an ``AsyncVectorEnv`` is an integer or a flag.
 
     Examples:
         >>> from torchrl_safe.envs.gym import ArmGymEnv
@@ -347,6 +365,23 @@ class SafeGymWrapper(_CostBesideReward):
         if isinstance(env, gymnasium.vector.VectorEnv):
             autoreset.set_mode(env)
         super().__init__(env=env, **kwargs)
+        if isinstance(env.unwrapped, SyncVectorEnv):
+            alone = env.unwrapped.envs
+            alone[:] = [_FloatCosts(each, self._cost_paths) for each in alone]
+
+    def _checked(self, path: tuple[str, ...], value: Any) -> Any:
+        if (
+            isinstance(value, np.ndarray)
+            and value.dtype.kind in "biu"
+            and isinstance(self._env.unwrapped, AsyncVectorEnv)
+        ):
+            warnings.warn(
+                f"cost {'.'.join(path)!r} is {value.dtype} in the first environment, and so in all "
+                "others: fractions are lost. Return float(cost), or make the environment by "
+                "SafeGymEnv.",
+                stacklevel=2,
+            )
+        return super()._checked(path, value)
 
 
 class SafeGymEnv(_CostBesideReward, GymEnv):
