@@ -8,13 +8,15 @@ import pytest
 import torch
 from counting import flagged
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 from torchrl._utils import seed_generator
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import (
     Compose,
     ExcludeTransform,
     GymWrapper,
+    InitTracker,
     RenameTransform,
     RewardSum,
     SerialEnv,
@@ -22,6 +24,7 @@ from torchrl.envs import (
     default_info_dict_reader,
 )
 from torchrl.envs.utils import ExplorationType, RandomPolicy, exploration_type
+from torchrl.modules import LSTMModule
 from torchrl.objectives import LossModule
 
 from experiments.log import figures
@@ -177,6 +180,15 @@ def test_done_flags_in_a_group_are_refused():
     env = counting(RenameTransform(["done"], [("agent", "done")]))
     with pytest.raises(ValueError, match="env must have the key 'done', got "):
         evaluate(env, STILL, 2, seed=0)
+
+
+def test_a_recurrent_policy_needs_its_primer():
+    """Without one, TorchRL would drop its state after each step."""
+    lstm = LSTMModule(input_size=2, hidden_size=3, in_key="observation", out_key="hidden")
+    actor = TensorDictSequential(lstm, TensorDictModule(nn.Linear(3, 1), ["hidden"], ["action"]))
+    evaluate(counting(InitTracker(), lstm.make_tensordict_primer()), actor, 2, seed=0)
+    with pytest.raises(ValueError, match=r"env must have the keys .*recurrent_state_h"):
+        evaluate(counting(InitTracker()), actor, 2, seed=0)
 
 
 def test_an_environment_comes_first(make_env):

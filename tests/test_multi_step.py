@@ -90,15 +90,33 @@ def test_original_reward_is_that_of_the_key_named_last():
 
 def test_costs_of_whole_episodes_stay():
     """What an updater is stepped with: a step that ends an episode has nothing ahead of it."""
-    batch, after = make_batch()["next"], through_postproc("reward", "cost")["next"]
+    batch, after = make_batch()["next"], with_done_keys(("done", "truncated"))["next"]
+    assert torch.equal(after["done"], batch["done"])
     done = batch["done"].squeeze(-1)
     assert torch.equal(after["episode_cost"][done], batch["episode_cost"][done])
 
 
-@pytest.mark.parametrize(("done_keys", "lost"), [([], 0), (None, 2)])
-def test_target_of_the_cost_critic(done_keys, lost):
-    """Without ``done_keys=[]`` the steps before the last bootstrap from the end of the episode."""
-    data = through_buffer(reward_keys=["cost", "reward"], done_keys=done_keys)
+def with_done_keys(keys):
+    postproc = MultiStep(gamma=GAMMA, n_steps=3)
+    postproc.reward_keys = ("reward", "cost")
+    if keys is not None:
+        postproc.done_keys = keys
+    return postproc(make_batch())
+
+
+@pytest.mark.parametrize(
+    ("make", "lost"),
+    [
+        (lambda: through_buffer(reward_keys=["cost", "reward"], done_keys=[]), 0),
+        (lambda: through_buffer(reward_keys=["cost", "reward"]), 2),
+        (lambda: with_done_keys(("done", "truncated")), 0),
+        (lambda: with_done_keys(None), 2),
+    ],
+    ids=["buffer", "buffer-default", "postproc", "postproc-default"],
+)
+def test_target_of_the_cost_critic(make, lost):
+    """With TorchRL's own ``done_keys`` the last steps bootstrap from the end of the episode."""
+    data = make()
     # A critic that says 100 and 1000 everywhere.
     data["next", "state_action_cost_value"] = torch.tensor([100.0, 1000.0]).expand(*data.shape, 2)
     target = CostTD0(gamma=GAMMA).value_estimate(data)[0, :6]

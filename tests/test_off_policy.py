@@ -21,6 +21,7 @@ from off_policy import (
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.nn.functional import smooth_l1_loss
+from torchrl.data import Bounded
 from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate
 
@@ -34,6 +35,7 @@ from torchrl_safe.objectives import (
 from torchrl_safe.testing import (
     check_equals_at_zero,
     make_q_critic,
+    make_q_networks,
     make_transitions,
 )
 
@@ -426,3 +428,17 @@ def test_the_actor_loss_trains_no_critic(kind):
     loss = make_loss(kind, multiplier_init=1.0)
     call(loss, make_transitions())["loss_actor"].backward()
     assert networks_with_gradient(loss) == {"actor"}
+
+
+def test_bounds_in_double_precision_leave_the_next_action_single():
+    """Safety-Gymnasium's and DMControl's action specs are of such numbers."""
+    batch, losses = make_transitions(1), []
+    for dtype in (torch.float32, torch.float64):
+        torch.manual_seed(0)
+        networks = make_q_networks(1, deterministic=True)
+        spec = Bounded(-0.1, 0.1, batch["action"].shape[-1:], dtype=dtype)
+        loss = TD3LagrangianLoss(*networks, action_spec=spec)
+        SoftUpdate(loss, tau=0.1)  # TorchRL warns without.
+        losses.append(loss(batch.clone()))
+    assert losses[0]["loss_qvalue"] == losses[1]["loss_qvalue"]
+    assert losses[0]["loss_cost_qvalue"] == losses[1]["loss_cost_qvalue"]

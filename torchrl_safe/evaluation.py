@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -64,8 +65,8 @@ def evaluate(
     Raises:
         TypeError: if ``env`` is no environment, ``policy`` cannot be called, or
             ``exploration_type`` is none.
-        ValueError: if the environment has no cost, reward or ``done``, or an episode has not ended
-            after ``max_steps``.
+        ValueError: if the environment has no cost, reward or ``done``, it has no key for the state
+            of a recurrent policy, or an episode has not ended after ``max_steps``.
 
     Examples:
         >>> from torchrl.envs.utils import RandomPolicy
@@ -177,6 +178,7 @@ def _play(
 ) -> TensorDictBase:
     """One episode in each environment of a batch, until the last of them has ended."""
     tensordict = env.reset()
+    _check_memory(policy, tensordict)
     running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
     figures: TensorDictBase | None = None
     for step in range(1, max_steps + 1):
@@ -191,6 +193,18 @@ def _play(
         f"max_steps must let every episode end, got {max_steps}, after which "
         f"{int(running.sum())} of {running.numel()} go on."
     )
+
+
+def _check_memory(policy: object, start: TensorDictBase) -> None:
+    """Raises ValueError for a recurrent policy whose state would be dropped after each step."""
+    if not isinstance(policy, TensorDictModuleBase):
+        return
+    states = [key for key in policy.in_keys if unravel_key(("next", key)) in policy.out_keys]
+    if lost := [key for key in states if start.get(key, None) is None]:
+        raise ValueError(
+            f"env must have the keys {lost}, the state of a recurrent policy: append the module's "
+            "make_tensordict_primer()."
+        )
 
 
 def _figures(after: TensorDictBase, before: TensorDictBase | None) -> TensorDictBase:

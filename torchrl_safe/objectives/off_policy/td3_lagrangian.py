@@ -106,7 +106,8 @@ class TD3LagrangianLoss(ConstrainedQLoss, TD3Loss):
         ):
             acted = self.actor_network(acted)
         action = acted.get(key) + noise.clamp(-self.noise_clip, self.noise_clip)
-        acted.set(key, action.clamp(self.min_action, self.max_action))
+        # A spec in double precision would make the action double.
+        acted.set(key, action.clamp(self.min_action.to(action), self.max_action.to(action)))
         return tensordict.get("next").copy().update(acted)
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
