@@ -3,12 +3,15 @@
 In step t of an episode of n steps: observation t, reward 10 t, cost t / 4.
 """
 
+from functools import partial
 from typing import ClassVar
 
 import gymnasium
 import numpy as np
+import pytest
 import torch
 from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper, Transform, TransformedEnv
@@ -16,6 +19,8 @@ from torchrl.envs import EnvBase, GymWrapper, Transform, TransformedEnv
 from torchrl_safe.envs import CostToReward
 
 FLAGS = ("done", "terminated", "truncated")
+MODES = [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
+by_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
 
 
 class Counting(gymnasium.Env):
@@ -164,3 +169,29 @@ def with_costs(num_envs=None, num_costs=1):
 
 def inside(transform, num_envs=None, num_costs=1):
     return with_costs(num_envs, num_costs).append_transform(transform())
+
+
+def vector(mode, *factories, kind=SyncVectorEnv):
+    factories = factories or (partial(Counting, 4), partial(Counting, 3))
+    return kind(factories, autoreset_mode=mode)
+
+
+def check_counts(rollout, lengths):
+    """Compares a rollout of episodes of these lengths, a row each, with what they must be."""
+    steps = rollout.shape[-1]
+    count = torch.stack([torch.arange(steps) % length for length in lengths]).float()
+    after, over = count + 1, count + 1 == torch.tensor(lengths)[:, None]
+    odd = torch.tensor(lengths)[:, None] % 2 == 1
+    rollout = rollout.reshape(len(lengths), steps)
+    for key, expected in {
+        "observation": count,
+        ("next", "observation"): after,
+        ("next", "reward"): 10 * after,
+        ("next", "done"): over,
+        ("next", "terminated"): over & odd,
+        ("next", "truncated"): over & ~odd,
+    }.items():
+        assert torch.equal(rollout[key].squeeze(-1), expected), key
+    assert torch.equal(rollout["next", "cost"][..., 0], after / 4)
+    assert rollout["next", "cost"].dtype == torch.float32
+    assert "cost" not in rollout

@@ -51,11 +51,17 @@ def make_batch():
     )
 
 
-def through_postproc(*reward_keys, gamma=GAMMA):
-    postproc = MultiStep(gamma=gamma, n_steps=3)
+def through_postproc(*reward_keys, done_keys=None):
+    postproc = MultiStep(gamma=GAMMA, n_steps=3)
     if reward_keys:
         postproc.reward_keys = reward_keys
+    if done_keys is not None:
+        postproc.done_keys = done_keys
     return postproc(make_batch())
+
+
+def summed_over_steps():
+    return through_postproc("reward", "cost", done_keys=("done", "truncated"))
 
 
 def through_buffer(**kwargs):
@@ -90,18 +96,10 @@ def test_original_reward_is_that_of_the_key_named_last():
 
 def test_costs_of_whole_episodes_stay():
     """What an updater is stepped with: a step that ends an episode has nothing ahead of it."""
-    batch, after = make_batch()["next"], with_done_keys(("done", "truncated"))["next"]
+    batch, after = make_batch()["next"], summed_over_steps()["next"]
     assert torch.equal(after["done"], batch["done"])
     done = batch["done"].squeeze(-1)
     assert torch.equal(after["episode_cost"][done], batch["episode_cost"][done])
-
-
-def with_done_keys(keys):
-    postproc = MultiStep(gamma=GAMMA, n_steps=3)
-    postproc.reward_keys = ("reward", "cost")
-    if keys is not None:
-        postproc.done_keys = keys
-    return postproc(make_batch())
 
 
 @pytest.mark.parametrize(
@@ -109,8 +107,8 @@ def with_done_keys(keys):
     [
         (lambda: through_buffer(reward_keys=["cost", "reward"], done_keys=[]), 0),
         (lambda: through_buffer(reward_keys=["cost", "reward"]), 2),
-        (lambda: with_done_keys(("done", "truncated")), 0),
-        (lambda: with_done_keys(None), 2),
+        (summed_over_steps, 0),
+        (lambda: through_postproc("reward", "cost"), 2),
     ],
     ids=["buffer", "buffer-default", "postproc", "postproc-default"],
 )

@@ -25,7 +25,7 @@ from experiments.suite_report import (
     table,
     whole,
 )
-from torchrl_safe.envs import SUITE, Human, SpeedAndSeparation
+from torchrl_safe.envs import SUITE, EarlyTermination, Human, Saute, SpeedAndSeparation
 from torchrl_safe.policy import load_policy
 
 pytestmark = pytest.mark.integration
@@ -97,15 +97,19 @@ def test_every_limit_reaches_the_updater():
     env.close()
 
 
+def budget_of(env):
+    (transform,) = (each for each in env.transform if isinstance(each, Saute | EarlyTermination))
+    return transform.budget.tolist()
+
+
 def test_a_share_of_each_limit_is_what_training_aims_at():
     """Updaters have the share, budgets and reports the limit."""
     config = suite_config("iiwa-reach-joints", physics="mujoco", limit_share=0.5)
     env = make_env(config, 2, 0, "ppo-saute", training=True)
-    (transform,) = (each for each in env.transform if hasattr(each, "budget"))
     updater = ALGORITHMS["ppo-lagrangian"].build(env, config).updater
     assert updater.cost_limit.tolist() == [0.125, 0.25, 0.25]
     assert config.cost_limits == {"collision": 0.25, "joint-limit": 0.5, "speed": 0.5}
-    assert transform.budget.tolist() == [0.25, 0.5, 0.5]
+    assert budget_of(env) == [0.25, 0.5, 0.5]
     env.close()
 
 
@@ -118,8 +122,7 @@ def test_a_saved_policy_is_evaluated_with_the_budget_of_its_training():
     settings = json.loads(json.dumps(dataclasses.asdict(Config(cost_limit=3.0)), default=str))
     saved = SimpleNamespace(settings={**settings, "name": "ppo-saute"})
     env = make_env(evaluate.training_config(saved), num_envs=1, algorithm="ppo-saute")
-    (transform,) = (each for each in env.transform if hasattr(each, "budget"))
-    assert transform.budget.tolist() == [3.0]
+    assert budget_of(env) == [3.0]
     env.close()
 
 
@@ -127,8 +130,7 @@ def test_a_saved_policy_is_evaluated_with_the_budget_of_its_training():
 def test_every_limit_is_a_budget(algorithm):
     config = suite_config(NAME, physics="mujoco")
     env = make_env(config, num_envs=1, algorithm=algorithm, training=True)
-    (transform,) = (each for each in env.transform if hasattr(each, "budget"))
-    assert transform.budget.tolist() == [*SUITE[NAME].cost_limits.values()]
+    assert budget_of(env) == [*SUITE[NAME].cost_limits.values()]
     env.close()
 
 

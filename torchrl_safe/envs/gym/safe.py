@@ -366,8 +366,8 @@ class SafeGymWrapper(_CostBesideReward):
             autoreset.set_mode(env)
         super().__init__(env=env, **kwargs)
         if isinstance(env.unwrapped, SyncVectorEnv):
-            alone = env.unwrapped.envs
-            alone[:] = [_FloatCosts(each, self._cost_paths) for each in alone]
+            singles = env.unwrapped.envs
+            singles[:] = [_FloatCosts(single, self._cost_paths) for single in singles]
 
     def _checked(self, path: tuple[str, ...], value: Any) -> Any:
         if (
